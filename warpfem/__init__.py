@@ -1,0 +1,1 @@
+"""warpfem: finite element simulation of elastic solids on NVIDIA Warp."""
