@@ -1,0 +1,26 @@
+"""Animations and meshes in USD: the only part of warpfem that imports ``pxr``.
+
+:class:`UsdWriter` stores a run frame by frame, :func:`read_animation` reads it back, and
+:func:`read_tet_mesh` and :func:`read_surface_mesh` take meshes from files that others made. All of them
+speak numpy; none knows of Warp, models or solvers.
+"""
+
+from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_animation
+from warpfem.usd.bodies import BodyFrame, UsdBody
+from warpfem.usd.colors import ColorQuantity, ColorScale
+from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
+from warpfem.usd.writer import UsdWriter
+
+__all__ = [
+    "AnimatedBody",
+    "AnimatedFrame",
+    "Animation",
+    "BodyFrame",
+    "ColorQuantity",
+    "ColorScale",
+    "UsdBody",
+    "UsdWriter",
+    "read_animation",
+    "read_surface_mesh",
+    "read_tet_mesh",
+]
