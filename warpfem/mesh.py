@@ -538,11 +538,16 @@ def _arrays(points: object, cells: object) -> tuple[np.ndarray, np.ndarray]:
             f"cells must be (m, {dim + 1}) {shape} for points in {dim}D, not of shape {indices.shape}"
         )
     positions = positions.astype(np.float64)
-    _reject("point", ~np.isfinite(positions).all(axis=1), "is not finite", "remove NaN and infinity")
-    outside = np.any((indices < 0) | (indices >= len(positions)), axis=1)
-    missing = f"refers to a point outside 0..{len(positions) - 1}"
-    _reject("cell", outside, missing, "count points from 0, without gaps")
+    _check_references("cell", positions, indices)
     return positions, indices.astype(np.int32)
+
+
+def _check_references(kind: str, points: np.ndarray, indices: np.ndarray) -> None:
+    """The points are finite, and each row of indices refers to some of them."""
+    _reject("point", ~np.isfinite(points).all(axis=1), "is not finite", "remove NaN and infinity")
+    outside = (indices.min(axis=1) < 0) | (indices.max(axis=1) >= len(points))
+    missing = f"refers to a point outside 0..{len(points) - 1}"
+    _reject(kind, outside, missing, "count points from 0, without gaps")
 
 
 def _check_cells(points: np.ndarray, cells: np.ndarray) -> None:

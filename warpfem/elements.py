@@ -1,0 +1,356 @@
+"""Linear simplex elements: the kernels of energy, force, force differential, stiffness and stress.
+
+A cell with rest shape matrix D_m has the constant displacement gradient H = sum_k (u_k - u_0) b_k^T, where
+b_k is row k of B = D_m^-1, the gradient of the k-th shape function; F = I + H (Hu 2020; Sifakis and Barbic
+2012). Kernels take the cells' data as ``cells, inverse_shape, volume, parameters`` and exist, each in a
+module of its own, only once something asks for them.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warpfem.dtypes import types
+from warpfem.materials.base import Constitutive
+from warpfem.tensor import (
+    deformation_gradient,
+    embed,
+    identity_like,
+    signed_svd,
+    volume_change,
+)
+
+
+@wp.func
+def _positive_part(A: Any):
+    """The symmetric matrix A with its negative eigenvalues set to zero."""
+    shift = wp.sqrt(wp.ddot(A, A))
+    V, _s, _V = signed_svd(A + shift * identity_like(A))  # positive semi-definite: V holds eigenvectors
+    D = wp.transpose(V) * A * V
+    return V * wp.cw_mul(identity_like(A), _clamped(D)) * wp.transpose(V)
+
+
+@wp.func
+def _clamped(A: Any):
+    for i in range(len(A)):
+        A[i, i] = wp.max(A[i, i], A.dtype(0.0))
+    return A
+
+
+class ElementKernels:
+    """The kernels for one material, dimension and precision, each made on first use."""
+
+    def __init__(self, constitutive: Constitutive, dim: int, dtype: str) -> None:
+        self.constitutive = constitutive
+        self.dim = dim
+        self.types = types(dim, dtype)
+        scalar, vector, matrix, cell_type = (
+            self.types.scalar,
+            self.types.vector,
+            self.types.matrix,
+            self.types.cell,
+        )
+        self.parameter_vector = wp.types.vector(length=constitutive.parameter_count, dtype=scalar)
+
+        @wp.func
+        def displacement_gradient(u: wp.array(dtype=vector), cell: cell_type, B: matrix):
+            origin = u[cell[0]]
+            H = wp.outer(u[cell[1]] - origin, B[0])
+            for k in range(1, dim):
+                H += wp.outer(u[cell[k + 1]] - origin, B[k])
+            return H
+
+        self._displacement_gradient = displacement_gradient
+
+    @functools.cached_property
+    def energy(self) -> wp.Kernel:
+        """Adds the volume-weighted energy of each cell to ``energy_out[0]`` (float64)."""
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        energy_density = self.constitutive.energy_density
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_energy(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            volume: wp.array(dtype=scalar),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            energy_out: wp.array(dtype=wp.float64),
+        ):
+            i = wp.tid()
+            H = displacement_gradient(u, cells[i], inverse_shape[i])
+            wp.atomic_add(energy_out, 0, wp.float64(volume[i] * energy_density(H, parameters[i])))
+
+        return element_energy
+
+    @functools.cached_property
+    def force(self) -> wp.Kernel:
+        """Adds the internal forces -dU/du to ``force_out``."""
+        return self._force_kernel(enable_backward=False)
+
+    @functools.cached_property
+    def taped_force(self) -> wp.Kernel:
+        """:attr:`force` with its adjoint, for ``wp.Tape``."""
+        return self._force_kernel(enable_backward=True)
+
+    def _force_kernel(self, enable_backward: bool) -> wp.Kernel:
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        stress = self.constitutive.stress
+
+        @wp.kernel(module="unique", enable_backward=enable_backward)
+        def element_force(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            volume: wp.array(dtype=scalar),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            force_out: wp.array(dtype=vector),
+        ):
+            i = wp.tid()
+            cell = cells[i]
+            B = inverse_shape[i]
+            H = displacement_gradient(u, cell, B)
+            weighted = -volume[i] * stress(H, parameters[i])
+            total = vector()
+            for k in range(dim):
+                f = weighted * B[k]
+                total += f
+                wp.atomic_add(force_out, cell[k + 1], f)
+            wp.atomic_add(force_out, cell[0], -total)
+
+        return element_force
+
+    @functools.cached_property
+    def differential(self) -> wp.Kernel:
+        """Adds K(u) p to ``product_out``, K = d²U/du² the tangent stiffness, without forming K."""
+        return self._differential_kernel(self._exact_rule())
+
+    @functools.cached_property
+    def clamped_differential(self) -> wp.Kernel:
+        """:attr:`differential` with each element's K made positive semi-definite (isotropic materials)."""
+        return self._differential_kernel(self._clamped_rule()) if self._clampable else self.differential
+
+    def _differential_kernel(self, rule: tuple) -> wp.Kernel:
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        tangent, apply = rule
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_differential(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            volume: wp.array(dtype=scalar),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            p: wp.array(dtype=vector),
+            product_out: wp.array(dtype=vector),
+        ):
+            i = wp.tid()
+            cell = cells[i]
+            B = inverse_shape[i]
+            H = displacement_gradient(u, cell, B)
+            dH = displacement_gradient(p, cell, B)
+            weighted = volume[i] * apply(tangent(H, parameters[i]), dH, parameters[i])
+            total = vector()
+            for k in range(dim):
+                f = weighted * B[k]
+                total += f
+                wp.atomic_add(product_out, cell[k + 1], f)
+            wp.atomic_add(product_out, cell[0], -total)
+
+        return element_differential
+
+    @functools.cached_property
+    def stiffness(self) -> wp.Kernel:
+        """Adds the d x d blocks K_ab of each cell's tangent stiffness to ``blocks_out[slots[i, a, b]]``."""
+        return self._stiffness_kernel(self._exact_rule())
+
+    @functools.cached_property
+    def clamped_stiffness(self) -> wp.Kernel:
+        """:attr:`stiffness` with each element's K made positive semi-definite (isotropic materials)."""
+        return self._stiffness_kernel(self._clamped_rule()) if self._clampable else self.stiffness
+
+    def _stiffness_kernel(self, rule: tuple) -> wp.Kernel:
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        tangent, apply = rule
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_stiffness(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            volume: wp.array(dtype=scalar),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            slots: wp.array3d(dtype=wp.int32),
+            blocks_out: wp.array(dtype=matrix),
+        ):
+            i = wp.tid()
+            cell = cells[i]
+            B = inverse_shape[i]
+            p = parameters[i]
+            V = volume[i]
+            material_tangent = tangent(displacement_gradient(u, cell, B), p)
+            count = int(dim)
+            for b in range(count):  # the columns of shape function b + 1, of component c
+                column_sum = matrix()
+                for c in range(count):
+                    axis = vector()
+                    axis[c] = scalar(1.0)
+                    dP = V * apply(material_tangent, wp.outer(axis, B[b]), p)
+                    for a in range(count):
+                        column = dP * B[a]
+                        block = wp.outer(column, axis)
+                        column_sum += block
+                        wp.atomic_add(blocks_out, slots[i, a + 1, b + 1], block)
+                        wp.atomic_add(blocks_out, slots[i, a + 1, 0], -block)
+                wp.atomic_add(blocks_out, slots[i, 0, b + 1], -column_sum)
+                wp.atomic_add(blocks_out, slots[i, 0, 0], column_sum)
+
+        return element_stiffness
+
+    @functools.cached_property
+    def stress(self) -> wp.Kernel:
+        """Writes the 3x3 first Piola-Kirchhoff stress of each cell (plane strain: with the normal stress)."""
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        stress = self.constitutive.stress
+        solid = wp.types.matrix(shape=(3, 3), dtype=scalar)
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_stress(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            stress_out: wp.array(dtype=solid),
+        ):
+            i = wp.tid()
+            H = displacement_gradient(u, cells[i], inverse_shape[i])
+            stress_out[i] = stress(embed(H), parameters[i])
+
+        return element_stress
+
+    @functools.cached_property
+    def diagnostics(self) -> wp.Kernel:
+        """Writes J and the von Mises stress sqrt(3/2) |dev sigma| of each cell."""
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        stress = self.constitutive.stress
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_diagnostics(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            jacobian_out: wp.array(dtype=scalar),
+            von_mises_out: wp.array(dtype=scalar),
+        ):
+            i = wp.tid()
+            H = embed(displacement_gradient(u, cells[i], inverse_shape[i]))
+            J = scalar(1.0) + volume_change(H)
+            kirchhoff = stress(H, parameters[i]) * wp.transpose(deformation_gradient(H))
+            deviator = kirchhoff - (wp.trace(kirchhoff) / scalar(3.0)) * identity_like(H)
+            jacobian_out[i] = J
+            von_mises_out[i] = wp.sqrt(scalar(1.5) * wp.ddot(deviator, deviator)) / wp.abs(J)
+
+        return element_diagnostics
+
+    @property
+    def _clampable(self) -> bool:
+        return self.constitutive.isotropic and not self.constitutive.convex
+
+    @property
+    def _types(self) -> tuple:
+        return self.types.scalar, self.types.vector, self.types.matrix, self.types.cell
+
+    # A rule is a pair of functions: tangent(H, parameters) does what depends on the state alone,
+    # apply(tangent, dH, parameters) gives dP.
+
+    def _exact_rule(self) -> tuple:
+        @wp.func
+        def tangent(H: Any, parameters: Any):
+            return H
+
+        return tangent, self.constitutive.stress_differential
+
+    def _clamped_rule(self) -> tuple:
+        """d²psi/dF² of an isotropic material with its negative eigenvalues set to zero.
+
+        In the principal axes, F = U diag(s) V^T, the fourth-order tensor falls into one d x d block that
+        couples the stretches, and for each pair (i, j) the 2x2 block [[a, b], [b, a]] of the entries ij and
+        ji with eigenvalues a + b (flip) and a - b (twist) (Smith, de Goes and Kim 2019). Its entries come
+        from the material's own differential at diag(s), so that no material has to state its eigenvalues.
+        """
+        dim = self.dim
+        matrix, vector, scalar = self.types.matrix, self.types.vector, self.types.scalar
+        stress_differential = self.constitutive.stress_differential
+
+        @wp.struct
+        class Tangent:
+            U: matrix
+            V: matrix
+            stretch: matrix
+            same: matrix
+            swapped: matrix
+
+        @wp.func
+        def tangent(H: matrix, parameters: Any):
+            U, s, V = signed_svd(deformation_gradient(H))
+            principal = wp.diag(s) - identity_like(H)
+            # Warp emits a function that calls wp.grad, as stress_differential may, after those that do not
+            _late = wp.grad(wp.neg)(s[0])
+            stretch = matrix()
+            same = matrix()
+            swapped = matrix()
+            count = int(dim)
+            for i in range(count):
+                for j in range(i, count):
+                    dH = matrix()
+                    dH[i, j] = scalar(1.0)
+                    dP = stress_differential(principal, dH, parameters)
+                    if i == j:
+                        for k in range(count):
+                            stretch[k, i] = dP[k, k]
+                    else:
+                        flip = wp.max(dP[i, j] + dP[j, i], scalar(0.0))
+                        twist = wp.max(dP[i, j] - dP[j, i], scalar(0.0))
+                        same[i, j] = scalar(0.5) * (flip + twist)
+                        same[j, i] = same[i, j]
+                        swapped[i, j] = scalar(0.5) * (flip - twist)
+                        swapped[j, i] = swapped[i, j]
+            result = Tangent()
+            result.U = U
+            result.V = V
+            result.stretch = _positive_part(scalar(0.5) * (stretch + wp.transpose(stretch)))
+            result.same = same
+            result.swapped = swapped
+            return result
+
+        @wp.func
+        def apply(t: Tangent, dH: matrix, parameters: Any):
+            G = wp.transpose(t.U) * dH * t.V
+            dP = wp.diag(t.stretch * wp.get_diag(G))
+            dP += wp.cw_mul(t.same, G) + wp.cw_mul(t.swapped, wp.transpose(G))
+            return t.U * dP * wp.transpose(t.V)
+
+        return tangent, apply
+
+
+@functools.cache
+def element_kernels(constitutive: Constitutive, dim: int, dtype: str) -> ElementKernels:
+    """The kernels of a material for ``dim`` 2 or 3 and ``dtype`` "float32" or "float64"; cached."""
+    return ElementKernels(constitutive, dim, dtype)

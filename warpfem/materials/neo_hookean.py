@@ -1,0 +1,60 @@
+"""The compressible Neo-Hookean material."""
+
+from typing import Any
+
+import warp as wp
+
+from warpfem.materials.base import Constitutive, HookeanMaterial
+from warpfem.tensor import (
+    cofactor,
+    deformation_gradient,
+    distortion,
+    identity_like,
+    log1p,
+    log1p_deficit,
+    volume_change,
+)
+
+
+@wp.func
+def energy_density(H: Any, parameters: Any):
+    half = H.dtype(0.5)
+    j = volume_change(H)
+    if not (j > H.dtype(-1.0)):
+        return H.dtype(wp.inf)
+    log_j = log1p(j)
+    return parameters[0] * (half * distortion(H) + log1p_deficit(j)) + half * parameters[1] * log_j * log_j
+
+
+@wp.func
+def stress(H: Any, parameters: Any):
+    # P = tau F^-T with the Kirchhoff stress tau = mu (F F^T - I) + lam ln(J) I
+    j = volume_change(H)
+    transposed = wp.transpose(H)
+    kirchhoff = parameters[0] * (H + transposed + H * transposed) + (
+        parameters[1] * log1p(j)
+    ) * identity_like(H)
+    return (kirchhoff * cofactor(deformation_gradient(H))) / (H.dtype(1.0) + j)
+
+
+@wp.func
+def stress_differential(H: Any, dH: Any, parameters: Any):
+    # dP = mu dF + (mu - lam ln J) F^-T dF^T F^-T + lam (F^-T : dF) F^-T
+    j = volume_change(H)
+    G = cofactor(deformation_gradient(H)) / (H.dtype(1.0) + j)
+    return (
+        parameters[0] * dH
+        + (parameters[0] - parameters[1] * log1p(j)) * (G * wp.transpose(dH) * G)
+        + (parameters[1] * wp.ddot(G, dH)) * G
+    )
+
+
+class NeoHookean(HookeanMaterial):
+    """Neo-Hookean: psi = mu/2 (I_C - d) - mu ln J + lam/2 (ln J)^2 (Bonet and Wood 2008, eq. 6.27).
+
+    P = mu (F - F^-T) + lam ln(J) F^-T. For J > 0 only: the energy is infinite and the stress is not a
+    number for J <= 0. With lam < 0 (nu < 0) the energy has no lower bound.
+    """
+
+    name = "neo_hookean"
+    functions = Constitutive(energy_density, stress, stress_differential)

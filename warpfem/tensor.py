@@ -1,0 +1,395 @@
+"""Tensor algebra in kernels, for 2x2 and 3x3 matrices of either precision.
+
+H is the displacement gradient, F = I + H the deformation gradient, J = det F. The functions of H avoid the
+cancellation that the textbook forms in F suffer near rest (Shakeri, Brown et al. 2024).
+"""
+
+from typing import Any
+
+import warp as wp
+
+mat22 = wp.types.matrix(shape=(2, 2), dtype=wp.Float)
+mat33 = wp.types.matrix(shape=(3, 3), dtype=wp.Float)
+
+
+@wp.func
+def identity_like(A: mat22):
+    one = A.dtype(1.0)
+    zero = A.dtype(0.0)
+    return wp.matrix_from_rows(wp.vector(one, zero), wp.vector(zero, one))
+
+
+@wp.func
+def identity_like(A: mat33):  # noqa: F811
+    one = A.dtype(1.0)
+    zero = A.dtype(0.0)
+    return wp.matrix_from_rows(
+        wp.vector(one, zero, zero), wp.vector(zero, one, zero), wp.vector(zero, zero, one)
+    )
+
+
+@wp.func
+def deformation_gradient(H: Any):
+    """F = I + H."""
+    return identity_like(H) + H
+
+
+@wp.func
+def symmetric_part(A: Any):
+    return A.dtype(0.5) * (A + wp.transpose(A))
+
+
+@wp.func
+def cofactor(A: mat22):
+    """cof A = d(det A)/dA, defined for every A."""
+    return wp.matrix_from_rows(wp.vector(A[1, 1], -A[1, 0]), wp.vector(-A[0, 1], A[0, 0]))
+
+
+@wp.func
+def cofactor(A: mat33):  # noqa: F811
+    r0 = wp.vector(A[0, 0], A[0, 1], A[0, 2])
+    r1 = wp.vector(A[1, 0], A[1, 1], A[1, 2])
+    r2 = wp.vector(A[2, 0], A[2, 1], A[2, 2])
+    return wp.matrix_from_rows(wp.cross(r1, r2), wp.cross(r2, r0), wp.cross(r0, r1))
+
+
+@wp.func
+def cofactor_differential(A: mat22, dA: mat22):
+    """d(cof A) for the change dA of A."""
+    return cofactor(dA)
+
+
+@wp.func
+def cofactor_differential(A: mat33, dA: mat33):  # noqa: F811
+    r0 = wp.vector(A[0, 0], A[0, 1], A[0, 2])
+    r1 = wp.vector(A[1, 0], A[1, 1], A[1, 2])
+    r2 = wp.vector(A[2, 0], A[2, 1], A[2, 2])
+    d0 = wp.vector(dA[0, 0], dA[0, 1], dA[0, 2])
+    d1 = wp.vector(dA[1, 0], dA[1, 1], dA[1, 2])
+    d2 = wp.vector(dA[2, 0], dA[2, 1], dA[2, 2])
+    return wp.matrix_from_rows(
+        wp.cross(d1, r2) + wp.cross(r1, d2),
+        wp.cross(d2, r0) + wp.cross(r2, d0),
+        wp.cross(d0, r1) + wp.cross(r0, d1),
+    )
+
+
+@wp.func
+def volume_change(H: mat22):
+    """J - 1 = tr H + det H."""
+    return H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+
+
+@wp.func
+def volume_change(H: mat33):  # noqa: F811
+    """J - 1 = tr H + I2(H) + det H."""
+    return wp.trace(H) + second_invariant(H) + wp.determinant(H)
+
+
+@wp.func
+def second_invariant(H: mat33):
+    """I2(H) = sum of the principal 2x2 minors."""
+    return (
+        (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+        + (H[1, 1] * H[2, 2] - H[1, 2] * H[2, 1])
+        + (H[0, 0] * H[2, 2] - H[0, 2] * H[2, 0])
+    )
+
+
+@wp.func
+def length_change(H: Any):
+    """I_C - d = tr(F^T F) - d = 2 tr H + |H|^2."""
+    return H.dtype(2.0) * wp.trace(H) + wp.ddot(H, H)
+
+
+@wp.func
+def distortion(H: mat22):
+    """I_C - d - 2 (J - 1), of second order in H."""
+    return wp.ddot(H, H) - H.dtype(2.0) * (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+
+
+@wp.func
+def distortion(H: mat33):  # noqa: F811
+    return wp.ddot(H, H) - H.dtype(2.0) * (second_invariant(H) + wp.determinant(H))
+
+
+@wp.func
+def cofactor_change(H: mat22):
+    """cof F - I = (tr H) I - H^T."""
+    return wp.trace(H) * identity_like(H) - wp.transpose(H)
+
+
+@wp.func
+def cofactor_change(H: mat33):  # noqa: F811
+    """cof F - I = (tr H) I - H^T + cof H."""
+    return wp.trace(H) * identity_like(H) - wp.transpose(H) + cofactor(H)
+
+
+@wp.func
+def log1p_deficit(y: Any):
+    """y - ln(1 + y) without cancellation; NaN for y < -1.
+
+    With z = y / (2 + y), ln(1 + y) = 2 atanh z, so that y - ln(1 + y) = y z - 2 (z^3/3 + z^5/5 + ...).
+    """
+    if wp.abs(y) > type(y)(0.3):
+        return y - wp.log(type(y)(1.0) + y)
+    z = y / (type(y)(2.0) + y)
+    w = z * z
+    series = type(y)(1.0 / 17.0)
+    series = series * w + type(y)(1.0 / 15.0)
+    series = series * w + type(y)(1.0 / 13.0)
+    series = series * w + type(y)(1.0 / 11.0)
+    series = series * w + type(y)(1.0 / 9.0)
+    series = series * w + type(y)(1.0 / 7.0)
+    series = series * w + type(y)(1.0 / 5.0)
+    series = series * w + type(y)(1.0 / 3.0)
+    return y * z - type(y)(2.0) * z * w * series
+
+
+@wp.func
+def log1p(y: Any):
+    """ln(1 + y), accurate for small y; NaN for y < -1."""
+    return y - log1p_deficit(y)
+
+
+@wp.func
+def embed(H: mat22):
+    """Plane strain: the 3x3 displacement gradient diag(H, 0)."""
+    zero = H.dtype(0.0)
+    return wp.matrix_from_rows(
+        wp.vector(H[0, 0], H[0, 1], zero), wp.vector(H[1, 0], H[1, 1], zero), wp.vector(zero, zero, zero)
+    )
+
+
+@wp.func
+def embed(H: mat33):  # noqa: F811
+    return H
+
+
+@wp.func
+def in_plane(A: mat33, like: mat22):
+    """The part of a 3x3 matrix that a body of the dimension of ``like`` feels."""
+    return wp.matrix_from_rows(wp.vector(A[0, 0], A[0, 1]), wp.vector(A[1, 0], A[1, 1]))
+
+
+@wp.func
+def in_plane(A: mat33, like: mat33):  # noqa: F811
+    return A
+
+
+# --- singular values -------------------------------------------------------------------------------------
+
+
+@wp.func
+def _orthogonalize(a: Any, b: Any, v: Any, w: Any):
+    """Rotates the columns (a, b) of a matrix to be orthogonal, and (v, w) with them (one Jacobi rotation)."""
+    alpha = wp.dot(a, a)
+    beta = wp.dot(b, b)
+    gamma = wp.dot(a, b)
+    one = type(gamma)(1.0)
+    c = one
+    s = type(gamma)(0.0)
+    if gamma * gamma > type(gamma)(1.0e-34) * alpha * beta:
+        zeta = (beta - alpha) / (type(gamma)(2.0) * gamma)
+        if wp.abs(zeta) < type(gamma)(1.0e18):
+            t = one / (wp.abs(zeta) + wp.sqrt(one + zeta * zeta))
+            if zeta < type(gamma)(0.0):
+                t = -t
+            c = one / wp.sqrt(one + t * t)
+            s = c * t
+    return c * a - s * b, s * a + c * b, c * v - s * w, s * v + c * w
+
+
+@wp.func
+def _ordered(a: Any, b: Any, v: Any, w: Any):
+    """(a, b, v, w) with |a| >= |b|: swapped by a quarter turn, which keeps the orientation of (v, w)."""
+    if wp.dot(a, a) < wp.dot(b, b):
+        return b, -a, w, -v
+    return a, b, v, w
+
+
+@wp.func
+def _any_perpendicular(a: Any):
+    """A unit vector perpendicular to the unit 3-vector a."""
+    zero = a.dtype(0.0)
+    if wp.abs(a[0]) > wp.abs(a[2]):
+        return wp.normalize(wp.vector(-a[1], a[0], zero))
+    return wp.normalize(wp.vector(zero, -a[2], a[1]))
+
+
+@wp.func
+def signed_svd(F: mat22):
+    """Rotations U, V and signed singular values s with F = U diag(s) V^T, s0 >= |s1| (Irving et al. 2004).
+
+    By one-sided Jacobi rotations, accurate for any scale. Not differentiable by Warp.
+    """
+    one = F.dtype(1.0)
+    zero = F.dtype(0.0)
+    scale = wp.max(wp.max(wp.abs(F[0, 0]), wp.abs(F[0, 1])), wp.max(wp.abs(F[1, 0]), wp.abs(F[1, 1])))
+    inverse_scale = one
+    if scale > zero:
+        inverse_scale = one / scale
+    a = wp.vector(F[0, 0], F[1, 0]) * inverse_scale
+    b = wp.vector(F[0, 1], F[1, 1]) * inverse_scale
+    v = wp.vector(one, zero)
+    w = wp.vector(zero, one)
+    a, b, v, w = _orthogonalize(a, b, v, w)
+    a, b, v, w = _ordered(a, b, v, w)
+    s0 = wp.length(a)
+    u = wp.vector(one, zero)
+    if s0 > zero:
+        u = a / s0
+    u1 = wp.vector(-u[1], u[0])
+    return wp.matrix_from_cols(u, u1), wp.vector(s0, wp.dot(u1, b)) * scale, wp.matrix_from_cols(v, w)
+
+
+@wp.func
+def signed_svd(F: mat33):  # noqa: F811
+    """Rotations U, V and signed singular values s with F = U diag(s) V^T, s0 >= s1 >= |s2|."""
+    one = F.dtype(1.0)
+    zero = F.dtype(0.0)
+    scale = zero
+    for i in range(3):
+        for j in range(3):
+            scale = wp.max(scale, wp.abs(F[i, j]))
+    inverse_scale = one
+    if scale > zero:
+        inverse_scale = one / scale
+    a = wp.vector(F[0, 0], F[1, 0], F[2, 0]) * inverse_scale
+    b = wp.vector(F[0, 1], F[1, 1], F[2, 1]) * inverse_scale
+    c = wp.vector(F[0, 2], F[1, 2], F[2, 2]) * inverse_scale
+    u = wp.vector(one, zero, zero)
+    v = wp.vector(zero, one, zero)
+    w = wp.vector(zero, zero, one)
+    sweeps = int(6)
+    for _sweep in range(sweeps):
+        a, b, u, v = _orthogonalize(a, b, u, v)
+        b, c, v, w = _orthogonalize(b, c, v, w)
+        a, c, u, w = _orthogonalize(a, c, u, w)
+    a, b, u, v = _ordered(a, b, u, v)
+    b, c, v, w = _ordered(b, c, v, w)
+    a, b, u, v = _ordered(a, b, u, v)
+    s0 = wp.length(a)
+    u0 = wp.vector(one, zero, zero)
+    if s0 > zero:
+        u0 = a / s0
+    b_rest = b - wp.dot(u0, b) * u0
+    u1 = _any_perpendicular(u0)
+    if wp.length(b_rest) > F.dtype(1.0e-30):
+        u1 = wp.normalize(b_rest)
+        u1 = wp.normalize(u1 - wp.dot(u0, u1) * u0)
+    u2 = wp.cross(u0, u1)
+    s = wp.vector(s0, wp.dot(u1, b), wp.dot(u2, c)) * scale
+    return wp.matrix_from_cols(u0, u1, u2), s, wp.matrix_from_cols(u, v, w)
+
+
+# --- rotation of the polar decomposition -----------------------------------------------------------------
+
+
+@wp.func
+def polar_rotation(F: mat22):
+    """The proper rotation R of F = R S with S symmetric and tr S >= 0: the rotation closest to F."""
+    c = F[0, 0] + F[1, 1]
+    s = F[1, 0] - F[0, 1]
+    r = wp.length(wp.vector(c, s))
+    if r > F.dtype(0.0):
+        c = c / r
+        s = s / r
+        return wp.matrix_from_rows(wp.vector(c, -s), wp.vector(s, c))
+    return identity_like(F)
+
+
+@wp.func
+def polar_rotation(F: mat33):  # noqa: F811
+    """The proper rotation R of F = R S closest to F, also for inverted F (there S has a negative eigenvalue).
+
+    i1 = tr S is the largest root of l^4 - 2 |F|^2 l^2 - 8 J l + |F|^4 - 4 |cof F|^2, the characteristic
+    polynomial of Davenport's matrix; by Cayley-Hamilton, with i2 and J the other invariants of S,
+    R = ((i1^2 - i2) F + i1 cof F - F F^T F) / (i1 i2 - J). Where that denominator (the product of the sums
+    of two singular values) nearly vanishes, the signed singular value decomposition decides.
+    """
+    one = F.dtype(1.0)
+    norm = wp.sqrt(wp.ddot(F, F))
+    if not (norm > F.dtype(0.0)):
+        return identity_like(F)
+    A = F * (one / norm)
+    C = cofactor(A)
+    J = wp.determinant(A)
+    c0 = one - F.dtype(4.0) * wp.ddot(C, C)
+    i1 = F.dtype(1.7320508075688772)
+    iterations = int(12)
+    for _iteration in range(iterations):
+        square = i1 * i1
+        value = (square - F.dtype(2.0)) * square - F.dtype(8.0) * J * i1 + c0
+        slope = F.dtype(4.0) * i1 * (square - one) - F.dtype(8.0) * J
+        if slope > F.dtype(0.0):
+            i1 = i1 - value / slope
+    i2 = F.dtype(0.5) * (i1 * i1 - one)
+    denominator = i1 * i2 - J
+    if not (denominator > F.dtype(2.0e-3)):
+        U, _s, V = signed_svd(F)
+        return U * wp.transpose(V)
+    R = ((i1 * i1 - i2) * A + i1 * C - A * wp.transpose(A) * A) * (one / denominator)
+    half = F.dtype(0.5)
+    for _polish in range(2):  # the rotation nearest to R, then Newton on skew(R^T A) = 0
+        R = R * (F.dtype(1.5) * identity_like(F) - half * (wp.transpose(R) * R))
+        R = R + R * skew(_rotation_rate(R, A, A - R * symmetric_part(wp.transpose(R) * A)))
+    return R * (F.dtype(1.5) * identity_like(F) - half * (wp.transpose(R) * R))
+
+
+@wp.func
+def skew(w: Any):
+    """The matrix of the cross product with the 3-vector w."""
+    zero = w.dtype(0.0)
+    return wp.matrix_from_rows(
+        wp.vector(zero, -w[2], w[1]), wp.vector(w[2], zero, -w[0]), wp.vector(-w[1], w[0], zero)
+    )
+
+
+@wp.func
+def _rotation_rate(R: mat33, F: mat33, G: mat33):
+    """The vector w with R^T dR = skew(w) when F changes by G: (tr(S) I - S) w = axial(R^T G - G^T R).
+
+    The matrix has the eigenvalues s_i + s_j; where one is nearly 0 the rate is bounded instead of infinite.
+    """
+    S = symmetric_part(wp.transpose(R) * F)
+    A = wp.trace(S) * identity_like(S) - S
+    T = wp.transpose(R) * G
+    axial = wp.vector(T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1])
+    size = wp.trace(A)
+    floor = F.dtype(1.0e-6) * wp.abs(size) * size * size + F.dtype(1.0e-30)
+    determinant = wp.determinant(A)
+    if wp.abs(determinant) < floor:
+        determinant = floor
+    return cofactor(A) * axial / determinant
+
+
+@wp.func
+def rotation_differential(F: mat22, G: mat22):
+    """dR for the change G of F."""
+    R = polar_rotation(F)
+    T = wp.transpose(R) * G
+    stretch = wp.length(wp.vector(F[0, 0] + F[1, 1], F[1, 0] - F[0, 1]))
+    floor = F.dtype(1.0e-6) * wp.sqrt(wp.ddot(F, F)) + F.dtype(1.0e-30)
+    w = (T[1, 0] - T[0, 1]) / wp.max(stretch, floor)
+    zero = F.dtype(0.0)
+    return R * wp.matrix_from_rows(wp.vector(zero, -w), wp.vector(w, zero))
+
+
+@wp.func
+def rotation_differential(F: mat33, G: mat33):  # noqa: F811
+    """dR for the change G of F, guarded where two singular values sum to zero."""
+    R = polar_rotation(F)
+    return R * skew(_rotation_rate(R, F, G))
+
+
+for _matrix in (wp.mat22f, wp.mat22d, wp.mat33f, wp.mat33d):
+
+    @wp.func
+    def rotation(F: _matrix):
+        """:func:`polar_rotation` with the exact derivative for Warp's reverse mode."""
+        return polar_rotation(F)
+
+    @wp.func_grad(rotation)
+    def _adjoint_rotation(F: _matrix, adjoint: _matrix):
+        wp.adjoint[F] += rotation_differential(F, adjoint)  # dR/dF is symmetric
