@@ -1,4 +1,4 @@
-"""Reads back what :class:`~warpfem.usd.writer.UsdWriter` wrote, also while it is being written."""
+"""Reads animations back, frame by frame, for pictures and tests."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from pxr import Usd, UsdGeom
 
 from warpfem.errors import OutputError
 from warpfem.usd.colors import ColorScale
-from warpfem.usd.meshes import open_stage, surface_of, world_matrix
+from warpfem.usd.meshes import triangles_of
 from warpfem.usd.prims import CELL_PRIMVARS, OBSTACLES, POINT_PRIMVARS, SURFACE, TETS, WORLD
-
-_SPHERE_RINGS = 16
+from warpfem.usd.stages import open_stage, reporting, world_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +64,11 @@ class Animation:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Opens the file; see :func:`read_animation`."""
+        """Opens the file.
+
+        Raises:
+            OutputError: a file that is missing, unreadable, or not of this kind.
+        """
         self._stage = stage = open_stage(path, OutputError)
         self.fps: float = stage.GetFramesPerSecond()
         self.up_axis: str = UsdGeom.GetStageUpAxis(stage)
@@ -81,19 +84,20 @@ class Animation:
         self.frame_count: int = UsdGeom.PointBased(surfaces[0]).GetPointsAttr().GetNumTimeSamples()
         self.bodies = tuple(self._body(index) for index in range(len(self._prims)))
         obstacles = stage.GetPrimAtPath(WORLD.AppendChild(OBSTACLES))
-        self.obstacles = tuple(
-            _obstacle(path, prim) for prim in (obstacles.GetChildren() if obstacles else [])
-        )
+        drawn = obstacles.GetChildren() if obstacles else []
+        self.obstacles = tuple(triangles_of(UsdGeom.Mesh(prim)) for prim in drawn)
 
     def frame(self, index: int) -> list[AnimatedFrame]:
         """Reads a frame: one entry per body.
 
         Raises:
             IndexError: there is no such frame.
+            OutputError: the file cannot be read any more.
         """
         if not 0 <= index < self.frame_count:
             raise IndexError(f"frame {index} of an animation of {self.frame_count} frames")
-        return [self._frame(body, index) for body in range(len(self._prims))]
+        with reporting(f"frame {index} cannot be read", OutputError):
+            return [self._frame(body, index) for body in range(len(self._prims))]
 
     def _body(self, body: int) -> AnimatedBody:
         prim = self._prims[body]
@@ -124,25 +128,9 @@ class Animation:
 
 
 def read_animation(path: str | Path) -> Animation:
-    """Opens an animation that :class:`~warpfem.usd.writer.UsdWriter` wrote, finished or partial.
+    """Opens an animation that :class:`UsdWriter` wrote, finished or partial, also while it is being written.
 
     Raises:
         OutputError: a file that is missing, unreadable, or not of this kind.
     """
     return Animation(path)
-
-
-def _obstacle(path: str | Path, prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
-    if prim.IsA(UsdGeom.Mesh):
-        return surface_of(path, UsdGeom.Mesh(prim))
-    columns = 2 * _SPHERE_RINGS
-    polar, around = np.meshgrid(
-        np.linspace(0.0, np.pi, _SPHERE_RINGS + 1), np.linspace(0.0, 2.0 * np.pi, columns + 1), indexing="ij"
-    )
-    unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=-1)
-    grid = np.arange(unit[..., 0].size).reshape(polar.shape)
-    a, b, c, d = (corner.ravel() for corner in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
-    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])]).astype(np.int32)
-    matrix = world_matrix(prim)
-    points = UsdGeom.Sphere(prim).GetRadiusAttr().Get() * unit.reshape(-1, 3)
-    return points @ matrix[:3, :3] + matrix[3, :3], triangles

@@ -82,18 +82,17 @@ def as_float32(where: str, values: np.ndarray) -> np.ndarray:
     """
     with np.errstate(over="ignore"):
         single = np.ascontiguousarray(values, np.float32)
-    finite = np.isfinite(single).reshape(len(single), -1).all(axis=1)
-    if not finite.all():
-        first = int(np.argmin(finite))
+    bad = np.flatnonzero(~np.isfinite(single.reshape(len(single), -1)).all(axis=1))
+    if len(bad):
         raise OutputError(
-            f"{where}: {len(finite) - finite.sum()} of {len(finite)} values are not finite, the first one at index "
-            f"{first}: {values[first]}; the run has diverged before this frame"
+            f"{where}: {len(bad)} of {len(single)} are not finite in float32, the first one is {bad[0]}: "
+            f"{values[bad[0]]}; the run has diverged before this frame"
         )
     return single
 
 
 class CellAverage:
-    """From one value per cell to one per point: the average over its cells, weighted by their rest volumes."""
+    """From a value per cell to one per point: the average over its cells, weighted by their rest volumes."""
 
     def __init__(self, rest_points: np.ndarray, cells: np.ndarray) -> None:
         corners = rest_points[cells]
@@ -130,8 +129,8 @@ def cells_of_faces(body: UsdBody) -> np.ndarray:
     stray = np.flatnonzero(keys[found] != wanted)
     if len(stray):
         raise OutputError(
-            f"body {body.name!r}: {len(stray)} surface faces belong to no cell, the first one is face {stray[0]}: "
-            f"{body.surface_faces[stray[0]].tolist()}"
+            f"body {body.name!r}: {len(stray)} surface faces belong to no cell, the first one is face "
+            f"{stray[0]}: {body.surface_faces[stray[0]].tolist()}"
         )
     return owners[found]
 

@@ -76,13 +76,13 @@ class ColorScale:
         return np.column_stack([np.interp(position, range(len(anchors)), channel) for channel in anchors.T])
 
     def linear(self, values: np.ndarray) -> np.ndarray:
-        """The colours of :meth:`srgb` as (n, 3) float32 linear light, which is what ``displayColor`` holds."""
+        """The colours of :meth:`srgb` in linear light, as ``displayColor`` holds them: (n, 3) float32."""
         srgb = self.srgb(values)
         linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
         return linear.astype(np.float32)
 
 
 def spread_of(quantity: ColorQuantity, values: np.ndarray) -> float:
-    """How far values go from rest, leaving out the outermost 0.5 %: one singular corner is not the picture."""
+    """How far values go from rest, less the outermost 0.5 %: one singular corner is not the picture."""
     rest = 0.0 if quantity == "von_mises" else 1.0
     return float(np.percentile(np.abs(values - rest), 99.5))

@@ -72,7 +72,7 @@ def set_clock(layer: Sdf.Layer, fps: float, frame_count: int) -> None:
     layer.startTimeCode, layer.endTimeCode = 0.0, float(max(frame_count - 1, 0))
 
 
-def define_obstacle(prim: UsdGeom.Gprim) -> None:
+def paint_obstacle(prim: UsdGeom.Gprim) -> None:
     """Gives an obstacle its neutral colour."""
     prim.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(_OBSTACLE_GREY)]))
     bind(prim.GetPrim(), "Obstacle")
@@ -176,7 +176,7 @@ class BodyPrims:
         label = f"{where}, body {self.body.name!r}"
         points = as_float32(f"{label}, points", in_space(frame.points) - self._origin)
         velocities = as_float32(f"{label}, velocities", in_space(frame.velocities))
-        cells = {
+        cells: dict[ColorQuantity, np.ndarray] = {
             "von_mises": as_float32(f"{label}, von_mises", frame.von_mises),
             "jacobian": as_float32(f"{label}, jacobian", frame.jacobian),
         }

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd
+from pxr import Gf, Sdf, Usd
 
 from warpfem.boundary import Obstacle
 from warpfem.errors import OutputError
@@ -19,6 +18,7 @@ from warpfem.usd.chunks import ChunkedLayer, Samples
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.obstacles import define_obstacles
 from warpfem.usd.prims import POINT_PRIMVARS, BodyPrims, define_world, prim_names
+from warpfem.usd.stages import reporting
 
 SUFFIXES = (".usdc", ".usd", ".usda")
 
@@ -26,20 +26,22 @@ SUFFIXES = (".usdc", ".usd", ".usda")
 class UsdWriter:
     """Stores an animation of elastic bodies as one USD file.
 
-    While the run goes, the frames are in ``<stem>.partial.usda`` (with the folder ``<stem>.partial`` beside it),
-    which opens at any moment, also after the process was killed. A frame is on disk at once if the last save
-    was more than half a second ago, and with the eighth one waiting otherwise. :meth:`close` merges everything
-    into ``path`` and removes the partial file; until then an older ``path`` stays as it is. **The next writer
-    of the same ``path`` removes a partial file that a killed run left**: rename it to keep it.
+    While the run goes, the frames are in ``<stem>.partial.usda`` (with the folder ``<stem>.partial`` beside
+    it), which opens at any moment, also after the process was killed. A frame that comes half a second or
+    more after the last save is saved at once; faster ones wait until they are ``frames_per_chunk``.
+    :meth:`close` merges everything into ``path`` and removes the partial file; until then an older ``path``
+    stays as it is. **The next writer of the same ``path`` removes a partial file that a killed run left**:
+    to keep it, choose another ``path`` or move file and folder elsewhere.
 
-    The file holds ``/World`` with an Xform per body. In it, ``surface`` is what viewers show; in 3D its sibling
-    ``simulation`` is the tetrahedral mesh with all points. The rest shape is the default value, frame i the
-    sample at time code i. Both have the primvars ``vonMises`` [Pa] and ``J`` per cell, ``vonMisesPoint`` and
-    ``JPoint`` per point (averages weighted by volume). ``displayColor`` shows one of the latter; the custom data
-    of ``/World`` says which and the range of its colours. Points are float32; those of a body that is far from
-    the origin for its size are relative to a double-precision translation of its Xform.
+    The file holds ``/World`` with an Xform per body. In it, ``surface`` is what viewers show; in 3D its
+    sibling ``simulation`` is the tetrahedral mesh with all points. The rest shape is the default value,
+    frame i the sample at time code i. Both have the primvars ``vonMises`` [Pa] and ``J`` per cell,
+    ``vonMisesPoint`` and ``JPoint`` per point (averages weighted by rest volume). ``displayColor`` shows
+    one of the latter; the custom data of ``/World`` says which, and the range of its colours. Points are
+    float32; those of a body that is far from the origin for its size are relative to a double-precision
+    translation of its Xform.
 
-    Used as a context manager it closes also when the body raises, so that all finished frames are kept.
+    Used as a context manager it closes also when the block raises, so that all finished frames are kept.
     """
 
     def __init__(
@@ -64,9 +66,9 @@ class UsdWriter:
             up_axis: the axis that viewers show as up.
             obstacles: drawn as fixed prims.
             color_by: the quantity that ``displayColor`` shows.
-            color_range: values of the first and last colour; ``None``: 0..s for von Mises and 1 - s..1 + s for J,
-                where s leaves out the outermost 0.5 % of points in the frame where it is largest.
-            frames_per_chunk: the most frames that wait in memory.
+            color_range: values of the first and last colour; ``None``: 0..s for von Mises, 1 - s..1 + s for
+                J, with s such that at most 0.5 % of a body's surface points are beyond in any frame.
+            frames_per_chunk: the most frames that wait in memory to be saved.
             comment: stored in the file as its comment.
 
         Raises:
@@ -78,7 +80,7 @@ class UsdWriter:
         self._fixed_range = color_range
         self._spread = 0.0
         self._closed = False
-        with self._reporting():
+        with reporting(f"{self.path} cannot be written", OutputError):
             static = Sdf.Layer.CreateAnonymous(".usdc")
             stage = Usd.Stage.Open(static)
             define_world(stage, fps, up_axis, comment)
@@ -89,7 +91,7 @@ class UsdWriter:
             rest = self._samples([body.rest for body in self._bodies], "the rest shape")
             for attribute, value in rest.items():
                 stage.GetAttributeAtPath(attribute).Set(value)
-            self._layer = ChunkedLayer(self.path, static, rest, frames_per_chunk)
+            self._layer = ChunkedLayer(self.path, static, rest, frames_per_chunk, self._metadata())
 
     def write_frame(self, frames: Sequence[BodyFrame]) -> None:
         """Adds the next frame.
@@ -108,7 +110,7 @@ class UsdWriter:
             raise OutputError(f"{where}: {len(frames)} bodies given, the file has {len(self._bodies)}")
         for body, frame in zip(self._bodies, frames, strict=True):
             body.check(frame, where)
-        with self._reporting():
+        with reporting(f"{self.path} cannot be written", OutputError):
             self._layer.append(self._samples(frames, where), self._metadata())
 
     def close(self) -> Path:
@@ -121,7 +123,8 @@ class UsdWriter:
             OutputError: the file cannot be written; the partial one stays.
         """
         if not self._closed:
-            with self._reporting():
+            saved = f"the frames are in {self._layer.path}"
+            with reporting(f"{self.path} cannot be written ({saved})", OutputError):
                 self._layer.merge(self._metadata(), self._colors)
             self._closed = True
         return self.path
@@ -165,15 +168,6 @@ class UsdWriter:
         for body in self._bodies:
             colors |= body.colors(samples, self._scale)
         return colors
-
-    @contextlib.contextmanager
-    def _reporting(self) -> Iterator[None]:
-        try:
-            yield
-        except OutputError:
-            raise
-        except (OSError, Tf.ErrorException) as error:
-            raise OutputError(f"{self.path} cannot be written: {error}; choose a place that can") from error
 
 
 def _check_settings(
