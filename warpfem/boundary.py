@@ -134,9 +134,7 @@ class Plane(_Obstacle):
         object.__setattr__(self, "point", _vector("Plane", "point", self.point))
         normal = np.array(_vector("Plane", "normal", self.normal))
         if not np.linalg.norm(normal) > 0.0 or len(normal) != len(self.point):
-            raise SceneError(
-                f"Plane: normal {tuple(self.normal)} must be non-zero and as long as point {self.point}"
-            )
+            raise SceneError(f"Plane: normal {tuple(self.normal)} must be non-zero and as long as point {self.point}")
         object.__setattr__(self, "normal", tuple(float(c) for c in normal / np.linalg.norm(normal)))
 
 

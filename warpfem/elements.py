@@ -296,7 +296,7 @@ class ElementKernels:
         from the material's own differential at diag(s), so that no material has to state its eigenvalues.
         """
         dim = self.dim
-        matrix, vector, scalar = self.types.matrix, self.types.vector, self.types.scalar
+        matrix, scalar = self.types.matrix, self.types.scalar
         stress_differential = self.constitutive.stress_differential
 
         @wp.struct

@@ -145,9 +145,7 @@ class Mesh:
         return cls(points[used], renumbered[cells], new_sets, cell_sets)  # type: ignore[arg-type]
 
     @classmethod
-    def rectangle(
-        cls, size: Sequence[float], cells: Sequence[int], origin: Sequence[float] = (0.0, 0.0)
-    ) -> Mesh:
+    def rectangle(cls, size: Sequence[float], cells: Sequence[int], origin: Sequence[float] = (0.0, 0.0)) -> Mesh:
         """Make a rectangle of right triangles, two per square, with diagonals that alternate.
 
         Point sets: ``left``, ``right`` (least and greatest x), ``bottom``, ``top`` (y).
@@ -513,9 +511,7 @@ def _reject(kind: str, bad: np.ndarray, problem: str, advice: str) -> None:
     """Raise, with the first index and the count, if anything is bad."""
     indices = np.flatnonzero(bad)
     if len(indices):
-        raise MeshError(
-            f"{kind} {indices[0]} {problem} ({len(indices)} of {len(bad)} {kind}s in all): {advice}"
-        )
+        raise MeshError(f"{kind} {indices[0]} {problem} ({len(indices)} of {len(bad)} {kind}s in all): {advice}")
 
 
 def _arrays(points: object, cells: object) -> tuple[np.ndarray, np.ndarray]:
@@ -534,9 +530,7 @@ def _arrays(points: object, cells: object) -> tuple[np.ndarray, np.ndarray]:
         )
     if indices.ndim != 2 or indices.shape[1] != dim + 1:
         shape = "triangles" if dim == 2 else "tetrahedra"
-        raise MeshError(
-            f"cells must be (m, {dim + 1}) {shape} for points in {dim}D, not of shape {indices.shape}"
-        )
+        raise MeshError(f"cells must be (m, {dim + 1}) {shape} for points in {dim}D, not of shape {indices.shape}")
     positions = positions.astype(np.float64)
     _check_references("cell", positions, indices)
     return positions, indices.astype(np.int32)

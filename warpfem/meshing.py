@@ -12,8 +12,9 @@ import re
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,8 @@ def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float
 
     The surface may intersect itself, have duplicate points or triangles of either orientation, and small
     holes. The mesh follows it within ``edge_length / 10``. Two runs differ, even in their numbers of cells.
-    Time grows with the fineness: seconds for a few thousand cells, minutes for a hundred thousand.
+    Time grows with the fineness: seconds for a few thousand cells, minutes for a hundred thousand. The
+    process works in another directory meanwhile, because fTetWild leaves a file in the current one.
 
     Args:
         points: (n, 3) positions [m].
@@ -129,16 +131,17 @@ def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float
     except ImportError as error:
         raise MissingExtraError("filling a surface", error.name or "pytetwild", "tet") from error
 
-    # fTetWild loses accuracy far from the origin, and takes points apart that lie on one another.
+    # fTetWild loses accuracy far from the origin, and takes unused points for part of the surface.
     welded, faces = np.unique(((corners - lower) / diagonal).reshape(-1, 3), axis=0, return_inverse=True)
     fraction = edge_length / diagonal
-    filled, cells = pytetwild.tetrahedralize(
-        welded,
-        faces.reshape(-1, 3).astype(np.int32),
-        edge_length_fac=fraction,
-        epsilon=fraction / 10.0,
-        vtk_ordering=True,
-    )
+    with TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file where it runs
+        filled, cells = pytetwild.tetrahedralize(
+            welded,
+            faces.reshape(-1, 3).astype(np.int32),
+            edge_length_fac=fraction,
+            epsilon=fraction / 10.0,
+            vtk_ordering=True,
+        )
     if not len(cells):
         raise MeshError("the surface encloses no volume: it is open, so close its holes")
     mesh = Mesh.repaired(lower + diagonal * filled, cells)

@@ -23,9 +23,7 @@ def identity_like(A: mat22):
 def identity_like(A: mat33):  # noqa: F811
     one = A.dtype(1.0)
     zero = A.dtype(0.0)
-    return wp.matrix_from_rows(
-        wp.vector(one, zero, zero), wp.vector(zero, one, zero), wp.vector(zero, zero, one)
-    )
+    return wp.matrix_from_rows(wp.vector(one, zero, zero), wp.vector(zero, one, zero), wp.vector(zero, zero, one))
 
 
 @wp.func
@@ -261,7 +259,7 @@ def signed_svd(F: mat33):  # noqa: F811
     u = wp.vector(one, zero, zero)
     v = wp.vector(zero, one, zero)
     w = wp.vector(zero, zero, one)
-    sweeps = int(6)
+    sweeps = 6
     for _sweep in range(sweeps):
         a, b, u, v = _orthogonalize(a, b, u, v)
         b, c, v, w = _orthogonalize(b, c, v, w)
@@ -317,7 +315,7 @@ def polar_rotation(F: mat33):  # noqa: F811
     J = wp.determinant(A)
     c0 = one - F.dtype(4.0) * wp.ddot(C, C)
     i1 = F.dtype(1.7320508075688772)
-    iterations = int(12)
+    iterations = 12
     for _iteration in range(iterations):
         square = i1 * i1
         value = (square - F.dtype(2.0)) * square - F.dtype(8.0) * J * i1 + c0
@@ -341,9 +339,7 @@ def polar_rotation(F: mat33):  # noqa: F811
 def skew(w: Any):
     """The matrix of the cross product with the 3-vector w."""
     zero = w.dtype(0.0)
-    return wp.matrix_from_rows(
-        wp.vector(zero, -w[2], w[1]), wp.vector(w[2], zero, -w[0]), wp.vector(-w[1], w[0], zero)
-    )
+    return wp.matrix_from_rows(wp.vector(zero, -w[2], w[1]), wp.vector(w[2], zero, -w[0]), wp.vector(-w[1], w[0], zero))
 
 
 @wp.func

@@ -23,7 +23,7 @@ def _cast(A: wp.mat33d, like: wp.float64):
 
 
 @wp.func
-def _cast(A: wp.mat33d, like: wp.float32):  # noqa: F811
+def _cast(A: wp.mat33d, like: wp.float32):
     return wp.matrix_from_rows(
         wp.vector(wp.float32(A[0, 0]), wp.float32(A[0, 1]), wp.float32(A[0, 2])),
         wp.vector(wp.float32(A[1, 0]), wp.float32(A[1, 1]), wp.float32(A[1, 2])),

@@ -31,9 +31,7 @@ def stress(H: Any, parameters: Any):
     # P = tau F^-T with the Kirchhoff stress tau = mu (F F^T - I) + lam ln(J) I
     j = volume_change(H)
     transposed = wp.transpose(H)
-    kirchhoff = parameters[0] * (H + transposed + H * transposed) + (
-        parameters[1] * log1p(j)
-    ) * identity_like(H)
+    kirchhoff = parameters[0] * (H + transposed + H * transposed) + (parameters[1] * log1p(j)) * identity_like(H)
     return (kirchhoff * cofactor(deformation_gradient(H))) / (H.dtype(1.0) + j)
 
 

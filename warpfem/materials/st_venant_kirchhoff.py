@@ -24,9 +24,7 @@ def energy_density(H: Any, parameters: Any):
 @wp.func
 def second_piola(strain: Any, parameters: Any):
     """S = 2 mu E + lam (tr E) I, linear in E."""
-    return (strain.dtype(2.0) * parameters[0]) * strain + (
-        parameters[1] * wp.trace(strain)
-    ) * identity_like(strain)
+    return (strain.dtype(2.0) * parameters[0]) * strain + (parameters[1] * wp.trace(strain)) * identity_like(strain)
 
 
 @wp.func

@@ -31,9 +31,7 @@ class UsdBody:
     def __post_init__(self) -> None:
         points = np.asarray(self.rest_points)
         if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) == 0:
-            raise OutputError(
-                f"body {self.name!r}: rest_points must have shape (n, 2 or 3), not {points.shape}"
-            )
+            raise OutputError(f"body {self.name!r}: rest_points must have shape (n, 2 or 3), not {points.shape}")
         if not np.isfinite(points).all():
             raise OutputError(f"body {self.name!r}: rest_points are not finite")
         for field, width in (("cells", points.shape[1] + 1), ("surface_faces", 3)):

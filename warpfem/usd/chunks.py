@@ -112,9 +112,7 @@ class ChunkedLayer:
             merged.unlink(missing_ok=True)
         self._remove()
 
-    def _write_merged(
-        self, path: Path, metadata: dict[str, Any], amend: Callable[[Samples], Samples]
-    ) -> None:
+    def _write_merged(self, path: Path, metadata: dict[str, Any], amend: Callable[[Samples], Samples]) -> None:
         merged = Sdf.Layer.CreateNew(str(path))
         merged.TransferContent(self._static)
         self._describe(merged, metadata)

@@ -58,9 +58,7 @@ class ColorScale:
     def from_spread(cls, quantity: ColorQuantity, spread: float) -> ColorScale:
         """The scale for values within ``spread`` of rest: 0..spread for von Mises, 1 ± spread for J."""
         width = spread if spread > 0.0 else 1.0
-        return (
-            cls(quantity, 0.0, width) if quantity == "von_mises" else cls(quantity, 1.0 - width, 1.0 + width)
-        )
+        return cls(quantity, 0.0, width) if quantity == "von_mises" else cls(quantity, 1.0 - width, 1.0 + width)
 
     def srgb(self, values: np.ndarray) -> np.ndarray:
         """Colours for a screen or a picture file.

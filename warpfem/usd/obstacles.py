@@ -17,9 +17,7 @@ _CORNERS = 64
 """Corners of a circle: its polygon is 0.12 % of the radius too small between them."""
 
 
-def define_obstacles(
-    stage: Usd.Stage, obstacles: Sequence[Obstacle], lower: np.ndarray, upper: np.ndarray
-) -> None:
+def define_obstacles(stage: Usd.Stage, obstacles: Sequence[Obstacle], lower: np.ndarray, upper: np.ndarray) -> None:
     """Authors the obstacles as meshes under ``/World/Obstacles``.
 
     A plane is drawn as far as four times the bodies' extent, as a quad (2D: a strip on its solid side),
@@ -83,9 +81,7 @@ def _ball(sphere: Sphere) -> Polygons:
     after = np.roll(grid, -1, axis=1)
     top, bottom = np.full(_CORNERS, grid.size), np.full(_CORNERS, grid.size + 1)
     quads = np.stack([grid[:-1], grid[1:], after[1:], after[:-1]], axis=-1).reshape(-1, 4)
-    caps = np.concatenate(
-        [np.column_stack([top, grid[0], after[0]]), np.column_stack([bottom, after[-1], grid[-1]])]
-    )
+    caps = np.concatenate([np.column_stack([top, grid[0], after[0]]), np.column_stack([bottom, after[-1], grid[-1]])])
     return np.array(sphere.center) + sphere.radius * points, [*quads, *caps]
 
 
@@ -128,9 +124,7 @@ def _border(box: BoxWalls, size: float) -> Polygons:
 def _bars(box: BoxWalls) -> Polygons:
     lower, upper = np.array(box.lower), np.array(box.upper)
     thickness = 0.01 * (upper - lower).max()
-    corners = np.array(
-        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-    )
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
     sides = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
     points: list[np.ndarray] = []
     faces: list[np.ndarray] = []

@@ -134,9 +134,7 @@ class BodyPrims:
             tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
             tets.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
             tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(body.cells.astype(np.int32)))
-            tets.CreateSurfaceFaceVertexIndicesAttr(
-                Vt.Vec3iArray.FromNumpy(body.surface_faces.astype(np.int32))
-            )
+            tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(body.surface_faces.astype(np.int32)))
             _create_primvars(tets)
         surface = UsdGeom.Mesh.Define(stage, self._surface)
         set_topology(surface, self._faces)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom
+from pxr import Sdf, Tf, Usd, UsdGeom
 
 from warpfem.errors import WarpfemError
 
@@ -36,7 +36,9 @@ def open_stage(path: str | Path, error: type[WarpfemError]) -> Usd.Stage:
     if not Path(path).is_file():
         raise error(f"{path}: there is no such file")
     with reporting(f"{path} cannot be read as USD", error):
-        stage = Usd.Stage.Open(str(path))
+        layer = Sdf.Layer.FindOrOpen(str(path))
+        layer.Reload()
+        stage = Usd.Stage.Open(layer)
         stage.Reload()
     return stage
 

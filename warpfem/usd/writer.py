@@ -157,9 +157,7 @@ class UsdWriter:
         samples: Samples = {}
         for body, frame in zip(self._bodies, frames, strict=True):
             samples |= body.samples(frame, where)
-        spreads = [
-            spread_of(self._quantity, body.surface_values(samples, self._quantity)) for body in self._bodies
-        ]
+        spreads = [spread_of(self._quantity, body.surface_values(samples, self._quantity)) for body in self._bodies]
         self._spread = max(self._spread, *spreads)
         return samples | self._colors(samples)
 
@@ -192,8 +190,6 @@ def _check_settings(
     if color_by not in POINT_PRIMVARS:
         raise OutputError(f"{path}: color_by must be one of {', '.join(POINT_PRIMVARS)}, not {color_by!r}")
     if color_range is not None and not (np.isfinite(color_range).all() and color_range[0] < color_range[1]):
-        raise OutputError(
-            f"{path}: color_range must be two finite numbers, the smaller one first, not {color_range}"
-        )
+        raise OutputError(f"{path}: color_range must be two finite numbers, the smaller one first, not {color_range}")
     if frames_per_chunk < 1:
         raise OutputError(f"{path}: frames_per_chunk must be at least 1, not {frames_per_chunk}")

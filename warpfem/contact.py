@@ -1,0 +1,371 @@
+"""Contact of boundary points with fixed obstacles: a penalty for depth, and Coulomb friction.
+
+A point at depth g below an obstacle's surface has the energy k A g^2 / 2, where A is the point's share of
+the rest surface and k the stiffness [Pa/m]; a pressure p therefore rests at the depth p / k. In implicit
+steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact, section 5) with
+normal force and normal of the step's start: below ``slip_speed`` it falls off quadratically, so that a point
+that ought to stick creeps, slower than ``slip_speed``. In explicit steps it is an impulse that stops the
+tangential motion, up to mu times the normal impulse.
+"""
+
+import functools
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warpfem.boundary import BoxWalls, Obstacle, Plane, Sphere
+from warpfem.dtypes import types
+from warpfem.scene import Body
+
+
+@functools.cache
+def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
+    """The kernels for one kind of obstacle, :class:`Plane` or :class:`Sphere`.
+
+    They take the obstacle as ``axis`` (the plane's normal; unused by a sphere) and ``radius`` (unused by a
+    plane), and each surface point's place relative to the plane's point or the sphere's centre.
+    """
+    t = types(dim, dtype)
+    vector, matrix, scalar = t.vector, t.matrix, t.scalar
+    module = f"warpfem.contact_{kind.__name__.lower()}_{dim}_{dtype}"
+
+    if kind is Plane:
+
+        @wp.func
+        def surface(y: vector, axis: vector, radius: scalar):
+            return wp.dot(axis, y), axis
+
+    else:
+
+        @wp.func
+        def surface(y: vector, axis: vector, radius: scalar):
+            distance = wp.length(y)
+            normal = vector()
+            normal[1] = scalar(1.0)
+            if distance > scalar(0.0):
+                normal = y / distance
+            return distance - radius, normal
+
+    @wp.func
+    def slip_weight(slip: scalar, limit: scalar):
+        """f1(slip) / slip and f1'(slip) of the smoothed Coulomb law f1 = 2 s/l - (s/l)^2, 1 above l."""
+        one = scalar(1.0)
+        two = scalar(2.0)
+        if slip < limit:
+            return (two - slip / limit) / limit, two * (one - slip / limit) / limit
+        return one / slip, scalar(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def friction_limit(
+        points: wp.array(dtype=wp.int32),
+        origin: wp.array(dtype=vector),
+        stiffness: wp.array(dtype=scalar),
+        axis: vector,
+        radius: scalar,
+        friction: scalar,
+        u: wp.array(dtype=vector),
+        magnitude_out: wp.array(dtype=scalar),
+        normal_out: wp.array(dtype=vector),
+    ):
+        """Writes the largest friction of each point, mu times its normal force, and its normal."""
+        k = wp.tid()
+        gap, normal = surface(origin[k] + u[points[k]], axis, radius)
+        magnitude_out[k] = friction * stiffness[k] * wp.max(-gap, scalar(0.0))
+        normal_out[k] = normal
+
+    @wp.kernel(module=module, enable_backward=False)
+    def energy(
+        points: wp.array(dtype=wp.int32),
+        origin: wp.array(dtype=vector),
+        stiffness: wp.array(dtype=scalar),
+        axis: vector,
+        radius: scalar,
+        u: wp.array(dtype=vector),
+        energy_out: wp.array(dtype=wp.float64),
+    ):
+        """Adds k A g^2 / 2 to ``energy_out[0]``."""
+        k = wp.tid()
+        gap, _normal = surface(origin[k] + u[points[k]], axis, radius)
+        if gap < scalar(0.0):
+            wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * stiffness[k] * gap * gap))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def force(
+        points: wp.array(dtype=wp.int32),
+        origin: wp.array(dtype=vector),
+        stiffness: wp.array(dtype=scalar),
+        axis: vector,
+        radius: scalar,
+        u: wp.array(dtype=vector),
+        force_out: wp.array(dtype=vector),
+    ):
+        """Adds the normal forces."""
+        k = wp.tid()
+        i = points[k]
+        gap, normal = surface(origin[k] + u[i], axis, radius)
+        if gap < scalar(0.0):
+            force_out[i] += (-stiffness[k] * gap) * normal
+
+    @wp.kernel(module=module, enable_backward=False)
+    def stiffness_blocks(
+        points: wp.array(dtype=wp.int32),
+        origin: wp.array(dtype=vector),
+        stiffness: wp.array(dtype=scalar),
+        axis: vector,
+        radius: scalar,
+        u: wp.array(dtype=vector),
+        blocks_out: wp.array(dtype=matrix),
+    ):
+        """Adds k A n n^T, the positive semi-definite part of the second derivative, to each point's block."""
+        k = wp.tid()
+        i = points[k]
+        gap, normal = surface(origin[k] + u[i], axis, radius)
+        if gap < scalar(0.0):
+            blocks_out[i] += stiffness[k] * wp.outer(normal, normal)
+
+    @wp.func
+    def slip_of(u: vector, u_start: vector, normal: vector):
+        s = u - u_start
+        return s - wp.dot(s, normal) * normal
+
+    @wp.kernel(module=module, enable_backward=False)
+    def friction_energy(
+        points: wp.array(dtype=wp.int32),
+        magnitude: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vector),
+        u_start: wp.array(dtype=vector),
+        slip_limit: scalar,
+        u: wp.array(dtype=vector),
+        energy_out: wp.array(dtype=wp.float64),
+    ):
+        """Adds the dissipation potential; ``magnitude`` is the friction limit."""
+        k = wp.tid()
+        if magnitude[k] > scalar(0.0):
+            i = points[k]
+            slip = wp.length(slip_of(u[i], u_start[i], normal[k]))
+            value = slip - slip_limit / scalar(3.0)
+            if slip < slip_limit:
+                value = slip * slip * (scalar(1.0) - slip / (scalar(3.0) * slip_limit)) / slip_limit
+            wp.atomic_add(energy_out, 0, wp.float64(magnitude[k] * value))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def friction_force(
+        points: wp.array(dtype=wp.int32),
+        magnitude: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vector),
+        u_start: wp.array(dtype=vector),
+        slip_limit: scalar,
+        u: wp.array(dtype=vector),
+        force_out: wp.array(dtype=vector),
+    ):
+        """Adds the friction of a step from ``u_start`` to ``u``."""
+        k = wp.tid()
+        if magnitude[k] > scalar(0.0):
+            i = points[k]
+            s = slip_of(u[i], u_start[i], normal[k])
+            weight, _slope = slip_weight(wp.length(s), slip_limit)
+            force_out[i] += (-magnitude[k] * weight) * s
+
+    @wp.kernel(module=module, enable_backward=False)
+    def friction_blocks(
+        points: wp.array(dtype=wp.int32),
+        magnitude: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vector),
+        u_start: wp.array(dtype=vector),
+        slip_limit: scalar,
+        u: wp.array(dtype=vector),
+        blocks_out: wp.array(dtype=matrix),
+    ):
+        """Adds the second derivative of the dissipation potential to each point's block."""
+        k = wp.tid()
+        if magnitude[k] > scalar(0.0):
+            i = points[k]
+            s = slip_of(u[i], u_start[i], normal[k])
+            slip = wp.length(s)
+            weight, slope = slip_weight(slip, slip_limit)
+            n = normal[k]
+            block = weight * (wp.identity(n=dim, dtype=scalar) - wp.outer(n, n))
+            if slip > scalar(0.0):
+                block += ((slope - weight) / (slip * slip)) * wp.outer(s, s)
+            blocks_out[i] += magnitude[k] * block
+
+    @wp.kernel(module=module, enable_backward=False)
+    def friction_impulse(
+        points: wp.array(dtype=wp.int32),
+        magnitude: wp.array(dtype=scalar),
+        normal: wp.array(dtype=vector),
+        inverse_mass: wp.array(dtype=scalar),
+        dt: scalar,
+        v_out: wp.array(dtype=vector),
+    ):
+        """Slows the tangential velocity by up to dt ``magnitude`` / m."""
+        k = wp.tid()
+        if magnitude[k] > scalar(0.0):
+            i = points[k]
+            v = v_out[i]
+            tangential = v - wp.dot(v, normal[k]) * normal[k]
+            speed = wp.length(tangential)
+            if speed > scalar(0.0):
+                drop = wp.min(dt * magnitude[k] * inverse_mass[i], speed)
+                v_out[i] = v - (drop / speed) * tangential
+
+    return SimpleNamespace(
+        friction_limit=friction_limit,
+        energy=energy,
+        force=force,
+        stiffness_blocks=stiffness_blocks,
+        friction_energy=friction_energy,
+        friction_force=friction_force,
+        friction_blocks=friction_blocks,
+        friction_impulse=friction_impulse,
+    )
+
+
+class _ObstacleContact:
+    """One half-space or sphere against all surface points."""
+
+    def __init__(self, obstacle: Plane | Sphere, surface: "ContactSurface", dtype: str) -> None:
+        dim = surface.rest.shape[1]
+        t = types(dim, dtype)
+        self.kernels = contact_kernels(type(obstacle), dim, dtype)
+        self.friction = obstacle.friction
+        self.device = surface.device
+        self.count = len(surface.rest)
+        self.points = surface.points
+        if isinstance(obstacle, Plane):
+            place, axis, radius = obstacle.point, obstacle.normal, 0.0
+        else:
+            place, axis, radius = obstacle.center, (0.0,) * dim, obstacle.radius
+        pressure_rate = surface.stiffness if obstacle.stiffness is None else obstacle.stiffness
+        self.shape = [t.vector(*axis), t.scalar(radius)]
+        self.origin = wp.array(surface.rest - np.array(place), dtype=t.vector, device=self.device)
+        self.host_stiffness = pressure_rate * surface.areas  # N/m
+        self.stiffness = wp.array(self.host_stiffness, dtype=t.scalar, device=self.device)
+        self.normal_arguments = [self.points, self.origin, self.stiffness, *self.shape]
+        if self.friction > 0.0:
+            self.magnitude = wp.zeros(self.count, dtype=t.scalar, device=self.device)
+            self.normal = wp.zeros(self.count, dtype=t.vector, device=self.device)
+
+    def arrays(self) -> list[wp.array]:
+        own = [self.origin, self.stiffness]
+        return [*own, self.magnitude, self.normal] if self.friction > 0.0 else own
+
+    def launch(self, name: str, inputs: list, outputs: list) -> None:
+        wp.launch(getattr(self.kernels, name), self.count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class ContactSurface:
+    """The boundary points of all bodies with their rest places, areas and default stiffness."""
+
+    def __init__(self, bodies: Sequence[Body], starts: Sequence[int], p_wave: Sequence[float], device) -> None:
+        rest, points, areas, stiffness = [], [], [], []
+        for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
+            mesh = body.mesh
+            share = np.zeros(mesh.point_count)
+            np.add.at(share, mesh.boundary_faces, (mesh.boundary_face_areas / mesh.dim)[:, None])
+            rest.append(mesh.points[mesh.boundary_points])
+            points.append(start + mesh.boundary_points)
+            areas.append(share[mesh.boundary_points])
+            stiffness.append(np.full(len(mesh.boundary_points), modulus / mesh.mean_edge_length))
+        self.device = device
+        self.rest = np.concatenate(rest)
+        self.host_points = np.concatenate(points)
+        self.points = wp.array(self.host_points, dtype=wp.int32, device=device)
+        self.areas = np.concatenate(areas)
+        self.stiffness = np.concatenate(stiffness)
+
+
+class Contact:
+    """All obstacles of a scene.
+
+    Attributes:
+        slip_speed: speed below which implicit friction is smoothed [m/s].
+    """
+
+    def __init__(self, obstacles: Sequence[Obstacle], surface: ContactSurface, slip_speed: float, dtype: str) -> None:
+        self.surface = surface
+        self.slip_speed = slip_speed
+        single: list[Plane | Sphere] = []
+        for obstacle in obstacles:
+            single += obstacle.planes() if isinstance(obstacle, BoxWalls) else [obstacle]
+        self._obstacles = single
+        self.parts = [_ObstacleContact(obstacle, surface, dtype) for obstacle in single]
+        self._rough = [part for part in self.parts if part.friction > 0.0]
+
+    @property
+    def rough(self) -> bool:
+        """Whether any obstacle has friction."""
+        return bool(self._rough)
+
+    def arrays(self) -> list[wp.array]:
+        """The device arrays held."""
+        return [self.surface.points, *(array for part in self.parts for array in part.arrays())]
+
+    def largest_stiffness_over_mass(self, mass: np.ndarray) -> float:
+        """An upper bound of the squared angular frequency [1/s^2] that contact adds."""
+        stiffness = sum(part.host_stiffness for part in self.parts)
+        return float((stiffness / mass[self.surface.host_points]).max())
+
+    def depth(self, u: np.ndarray) -> float:
+        """The greatest depth of penetration [m] at the displacements ``u`` (n, dim); 0 without contact."""
+        x = self.surface.rest + u[self.surface.host_points]
+        deepest = 0.0
+        for obstacle in self._obstacles:
+            if isinstance(obstacle, Plane):
+                gap = (x - np.array(obstacle.point)) @ np.array(obstacle.normal)
+            else:
+                gap = np.linalg.norm(x - np.array(obstacle.center), axis=1) - obstacle.radius
+            deepest = max(deepest, float(-gap.min()))
+        return deepest
+
+    def add_energy(self, u: wp.array, energy_out: wp.array) -> None:
+        """Adds the penalty energy to ``energy_out[0]``."""
+        for part in self.parts:
+            part.launch("energy", [*part.normal_arguments, u], [energy_out])
+
+    def add_force(self, u: wp.array, force_out: wp.array) -> None:
+        """Adds the normal forces."""
+        for part in self.parts:
+            part.launch("force", [*part.normal_arguments, u], [force_out])
+
+    def add_blocks(self, u: wp.array, blocks_out: wp.array) -> None:
+        """Adds each point's normal stiffness to its d x d block."""
+        for part in self.parts:
+            part.launch("stiffness_blocks", [*part.normal_arguments, u], [blocks_out])
+
+    # Friction of one step: begin_friction at its start, then the potential's terms at any trial u.
+
+    def begin_friction(self, u_start: wp.array) -> None:
+        """Takes normal forces and normals at ``u_start`` for the friction of the step that begins there."""
+        for part in self._rough:
+            part.launch(
+                "friction_limit",
+                [*part.normal_arguments, part.friction, u_start],
+                [part.magnitude, part.normal],
+            )
+
+    def _friction_arguments(self, part: _ObstacleContact, u_start: wp.array, dt: float, u: wp.array) -> list:
+        return [part.points, part.magnitude, part.normal, u_start, self.slip_speed * dt, u]
+
+    def add_friction_energy(self, u_start: wp.array, dt: float, u: wp.array, energy_out: wp.array) -> None:
+        """Adds the dissipation potential of the step from ``u_start`` to ``u``."""
+        for part in self._rough:
+            part.launch("friction_energy", self._friction_arguments(part, u_start, dt, u), [energy_out])
+
+    def add_friction_force(self, u_start: wp.array, dt: float, u: wp.array, force_out: wp.array) -> None:
+        """Adds the friction of the step from ``u_start`` to ``u``."""
+        for part in self._rough:
+            part.launch("friction_force", self._friction_arguments(part, u_start, dt, u), [force_out])
+
+    def add_friction_blocks(self, u_start: wp.array, dt: float, u: wp.array, blocks_out: wp.array) -> None:
+        """Adds the second derivative of the dissipation potential to each point's block."""
+        for part in self._rough:
+            part.launch("friction_blocks", self._friction_arguments(part, u_start, dt, u), [blocks_out])
+
+    def apply_friction_impulse(self, u: wp.array, inverse_mass: wp.array, dt: float, v: wp.array) -> None:
+        """Explicit friction over ``dt`` with the normal forces at ``u``."""
+        self.begin_friction(u)
+        for part in self._rough:
+            part.launch("friction_impulse", [part.points, part.magnitude, part.normal, inverse_mass, dt], [v])

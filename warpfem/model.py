@@ -1,0 +1,514 @@
+"""What the device needs for exactly one scene (Model), and what changes while it runs (State)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import prod
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import warp as wp
+
+from warpfem.boundary import PointForce, Traction
+from warpfem.dtypes import FloatName, types, uniform_array
+from warpfem.elements import ElementKernels, element_kernels
+from warpfem.errors import SceneError, SimulationError
+from warpfem.points import chunks, point_kernels
+from warpfem.scene import Body, Scene
+
+if TYPE_CHECKING:
+    from warpfem.contact import Contact
+    from warpfem.supports import Supports
+
+Route = Literal["tape", "closed", "assembled"]
+
+
+class State:
+    """What changes during a simulation.
+
+    Attributes:
+        u: displacements of all bodies' points, (point_count,) vectors [m], Warp array.
+        v: velocities [m/s], likewise.
+        time: simulated time [s].
+        revision: counts changes of ``u`` and ``v``; steppers that remember something about a state compare
+            it. :meth:`assign` advances it; after writing to ``u`` or ``v`` yourself, add 1.
+    """
+
+    def __init__(self, u: wp.array, v: wp.array, time: float = 0.0) -> None:
+        self.u = u
+        self.v = v
+        self.time = time
+        self.revision = 0
+
+    def assign(self, *, displacement: np.ndarray | None = None, velocity: np.ndarray | None = None) -> None:
+        """Overwrites displacements [m] or velocities [m/s], arrays (point_count, dim)."""
+        for target, value in ((self.u, displacement), (self.v, velocity)):
+            if value is not None:
+                array = np.asarray(value)
+                expected = (target.shape[0], target.dtype._length_)
+                if array.shape != expected:
+                    raise SimulationError(f"a state of this model takes shape {expected}, not {array.shape}")
+                target.assign(array.astype(wp.dtype_to_numpy(target.dtype._wp_scalar_type_)))
+        self.revision += 1
+
+    def copy(self) -> State:
+        """An independent copy."""
+        return State(wp.clone(self.u), wp.clone(self.v), self.time)
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """Displacements, a float64 copy (point_count, dim) [m]."""
+        return self.u.numpy().astype(np.float64)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities, a float64 copy (point_count, dim) [m/s]."""
+        return self.v.numpy().astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Energies of a state [J] (2D: per metre of thickness).
+
+    Attributes:
+        kinetic: sum of m |v|^2 / 2.
+        elastic: volume-weighted energy density; infinite if a cell of a barrier material has J <= 0.
+        load: potential of gravity and dead loads, 0 at rest shape.
+        contact: penalty energy of the obstacles.
+    """
+
+    kinetic: float
+    elastic: float
+    load: float
+    contact: float
+
+    @property
+    def total(self) -> float:
+        """The sum [J]."""
+        return self.kinetic + self.elastic + self.load + self.contact
+
+
+@dataclass(frozen=True, eq=False)
+class Stresses:
+    """Stresses of every cell as float64 arrays (cell_count, 3, 3) [Pa]; plane strain has its normal stress.
+
+    Attributes:
+        deformation_gradient: F; in 2D diag(F, 1).
+        first_piola_kirchhoff: P = dpsi/dF, force per rest area.
+        kirchhoff: tau = P F^T.
+        cauchy: sigma = tau / J, force per current area.
+        jacobian: J = det F, (cell_count,).
+        von_mises: sqrt(3/2) |dev sigma|, (cell_count,) [Pa].
+    """
+
+    deformation_gradient: np.ndarray
+    first_piola_kirchhoff: np.ndarray
+
+    @cached_property
+    def jacobian(self) -> np.ndarray:
+        return np.linalg.det(self.deformation_gradient)
+
+    @cached_property
+    def kirchhoff(self) -> np.ndarray:
+        return self.first_piola_kirchhoff @ self.deformation_gradient.transpose(0, 2, 1)
+
+    @cached_property
+    def cauchy(self) -> np.ndarray:
+        return self.kirchhoff / self.jacobian[:, None, None]
+
+    @cached_property
+    def von_mises(self) -> np.ndarray:
+        pressure = np.trace(self.cauchy, axis1=1, axis2=2) / 3.0
+        deviator = self.cauchy - pressure[:, None, None] * np.eye(3)
+        return np.sqrt(1.5 * np.einsum("cij,cij->c", deviator, deviator))
+
+
+class CellBlock:
+    """The cells of the bodies that share a material's kernels, on the device.
+
+    Attributes:
+        kernels: the kernels of the material.
+        index: the cells' numbers in the model, (count,) int.
+        count: cells.
+        arguments: device arrays ``cells, inverse_shape, volume, parameters``.
+    """
+
+    def __init__(self, kernels: ElementKernels, parts: list[tuple[Body, int, int]], device) -> None:
+        t = kernels.types
+        meshes = [body.mesh for body, _, _ in parts]
+        self.kernels = kernels
+        self.device = device
+        self.count = sum(mesh.cell_count for mesh in meshes)
+        self.index = np.concatenate([start + np.arange(b.mesh.cell_count) for b, _, start in parts])
+        self.host_cells = np.concatenate([start + body.mesh.cells for body, start, _ in parts])
+        rows = [body.material.parameter_rows(body.mesh.cell_count) for body, _, _ in parts]
+        if len(rows) == 1 and len(rows[0]) == 1:
+            parameters = uniform_array(rows[0], self.count, kernels.parameter_vector, device)
+        else:
+            table = [np.broadcast_to(r, (m.cell_count, r.shape[1])) for r, m in zip(rows, meshes, strict=True)]
+            parameters = wp.array(np.concatenate(table), dtype=kernels.parameter_vector, device=device)
+        self.arguments = [
+            wp.array(self.host_cells, dtype=t.cell, device=device),
+            wp.array(
+                np.concatenate([mesh.inverse_shape_matrices for mesh in meshes]),
+                dtype=t.matrix,
+                device=device,
+            ),
+            wp.array(np.concatenate([mesh.cell_volumes for mesh in meshes]), dtype=t.scalar, device=device),
+            parameters,
+        ]
+
+    def launch(self, name: str, inputs: list, outputs: list) -> None:
+        """Launches the kernel of that name over the cells."""
+        wp.launch(
+            getattr(self.kernels, name),
+            self.count,
+            inputs=[*self.arguments, *inputs],
+            outputs=outputs,
+            device=self.device,
+        )
+
+    def launch_stress(self, name: str, inputs: list, outputs: list) -> None:
+        """Launches a kernel that needs no volume."""
+        cells, inverse_shape, _, parameters = self.arguments
+        wp.launch(
+            getattr(self.kernels, name),
+            self.count,
+            inputs=[cells, inverse_shape, parameters, *inputs],
+            outputs=outputs,
+            device=self.device,
+        )
+
+
+class Model:
+    """A scene made ready for one device and precision; immutable while it is stepped.
+
+    Points and cells of all bodies are numbered through in the order of the scene's bodies. A term that the
+    scene lacks is ``None`` here: it has no array and no kernel.
+
+    Attributes:
+        scene: the scene.
+        device: Warp device.
+        dtype: "float32" or "float64".
+        types: the Warp types.
+        point_count, cell_count: totals over the bodies.
+        point_starts, cell_starts: first point and cell of each body, with the total at the end.
+        mass: lumped mass of each point [kg], device array.
+        inverse_mass: its inverse.
+        blocks: the cells by material.
+        dead_load: gravity and constant loads on each point [N], device array, or ``None``.
+        supports: held points, or ``None``.
+        contact: obstacles, or ``None``.
+
+    Raises:
+        SceneError: if the scene refers to something that does not exist or contradicts itself.
+    """
+
+    def __init__(self, scene: Scene, *, device: str | None = None, dtype: FloatName = "float32") -> None:
+        self.scene = scene
+        self.dtype = dtype
+        self.dim = scene.dim
+        self.types = types(scene.dim, dtype)
+        try:
+            self.device = wp.get_device(device)
+        except (RuntimeError, ValueError) as error:
+            raise SceneError(f"no device '{device}': {error}") from None
+        meshes = [body.mesh for body in scene.bodies]
+        self.point_starts = np.concatenate([[0], np.cumsum([mesh.point_count for mesh in meshes])])
+        self.cell_starts = np.concatenate([[0], np.cumsum([mesh.cell_count for mesh in meshes])])
+        self.point_count = int(self.point_starts[-1])
+        self.cell_count = int(self.cell_starts[-1])
+        self.host_mass = _lumped_mass(scene)
+        self.mass = self._device_array(self.host_mass, self.types.scalar)
+        self.inverse_mass = self._device_array(1.0 / self.host_mass, self.types.scalar)
+        self.blocks = self._cell_blocks()
+        load = _dead_load(scene, self.host_mass, self.point_starts)
+        self.dead_load = None if load is None else self._device_array(load, self.types.vector)
+        self.supports = self._supports()
+        self.contact = self._contact()
+        self._sum = wp.zeros(1, dtype=wp.float64, device=self.device)
+
+    # --- finalising -------------------------------------------------------------------------------------
+
+    def _device_array(self, data: np.ndarray, dtype: type) -> wp.array:
+        return wp.array(data, dtype=dtype, device=self.device)
+
+    def _cell_blocks(self) -> list[CellBlock]:
+        parts: dict[ElementKernels, list[tuple[Body, int, int]]] = {}
+        for body, point_start, cell_start in zip(self.scene.bodies, self.point_starts, self.cell_starts, strict=False):
+            kernels = element_kernels(body.material.constitutive, self.dim, self.dtype)
+            parts.setdefault(kernels, []).append((body, int(point_start), int(cell_start)))
+        return [CellBlock(kernels, bodies, self.device) for kernels, bodies in parts.items()]
+
+    def _supports(self) -> Supports | None:
+        if not any(body.supports for body in self.scene.bodies):
+            return None
+        from warpfem.supports import Supports
+
+        return Supports(self.scene.bodies, self.point_starts[:-1], self.dim, self.dtype, self.device)
+
+    def _contact(self) -> Contact | None:
+        if not self.scene.obstacles:
+            return None
+        from warpfem.contact import Contact, ContactSurface
+
+        surface = ContactSurface(self.scene.bodies, self.point_starts[:-1], self._p_wave_moduli(), self.device)
+        return Contact(self.scene.obstacles, surface, self._slip_speed(), self.dtype)
+
+    def _p_wave_moduli(self) -> list[float]:
+        """The largest P-wave modulus of each body at rest [Pa], d²psi/dF_xx² at F = I.
+
+        From each cell's own stiffness: the uniform stretch u = X_x e_x has the energy V/2 d²psi/dF_xx².
+        """
+        modulus = np.zeros(self.cell_count)
+        for block, stiffness in zip(self.blocks, self.element_stiffness(), strict=True):
+            _, inverse_shape, volume, _ = (array.numpy() for array in block.arguments)
+            edges = np.linalg.inv(inverse_shape.astype(np.float64))  # columns X_k - X_0
+            stretch = np.zeros((block.count, self.dim + 1, self.dim))
+            stretch[:, 1:, 0] = edges[:, 0, :]
+            work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
+            modulus[block.index] = work / volume
+        return [float(modulus[a:b].max()) for a, b in zip(self.cell_starts, self.cell_starts[1:], strict=False)]
+
+    def _slip_speed(self) -> float:
+        """1e-3 of the speed sqrt(g L) of a fall by the scene's size L; without gravity, 1e-3 L per second."""
+        corners = np.stack([body.mesh.bounding_box for body in self.scene.bodies])
+        size = float(np.linalg.norm(corners[:, 1].max(axis=0) - corners[:, 0].min(axis=0)))
+        gravity = 0.0 if self.scene.gravity is None else float(np.linalg.norm(self.scene.gravity))
+        return 1e-3 * (np.sqrt(gravity * size) if gravity > 0.0 else size)
+
+    # --- questions about a state ------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """The initial state of the scene."""
+        u = np.concatenate([body.initial_displacement() for body in self.scene.bodies])
+        v = np.concatenate([body.initial_velocity() for body in self.scene.bodies])
+        state = State(self._device_array(u, self.types.vector), self._device_array(v, self.types.vector))
+        if self.supports is not None:
+            self.supports.advance(0.0, 0.0)
+            self.supports.hold(state.u, state.v)
+        return state
+
+    def zeros(self) -> wp.array:
+        """A new vector of zeros per point."""
+        return wp.zeros(self.point_count, dtype=self.types.vector, device=self.device)
+
+    @property
+    def rest_points(self) -> np.ndarray:
+        """Rest positions of all points, (point_count, dim) float64 [m]."""
+        return np.concatenate([body.mesh.points for body in self.scene.bodies])
+
+    @property
+    def lumped_mass(self) -> np.ndarray:
+        """Lumped mass of each point, (point_count,) float64 [kg]."""
+        return self.host_mass.copy()
+
+    def dot(self, a: wp.array, b: wp.array) -> float:
+        """a . b over all points, summed in float64."""
+        self._sum.zero_()
+        kernel = point_kernels(self.dim, self.dtype).dot
+        wp.launch(kernel, chunks(a.shape[0]), inputs=[a, b], outputs=[self._sum], device=self.device)
+        return float(self._sum.numpy()[0])
+
+    def elastic_energy(self, u: wp.array) -> float:
+        """U(u) [J], summed in float64."""
+        self._sum.zero_()
+        for block in self.blocks:
+            block.launch("energy", [u], [self._sum])
+        return float(self._sum.numpy()[0])
+
+    def contact_energy(self, u: wp.array) -> float:
+        """Penalty energy of the obstacles [J]."""
+        if self.contact is None:
+            return 0.0
+        self._sum.zero_()
+        self.contact.add_energy(u, self._sum)
+        return float(self._sum.numpy()[0])
+
+    def energies(self, state: State) -> Energies:
+        """All energies of a state [J]."""
+        self._sum.zero_()
+        kernel = point_kernels(self.dim, self.dtype).kinetic_energy
+        wp.launch(
+            kernel,
+            chunks(self.point_count),
+            inputs=[self.mass, state.v],
+            outputs=[self._sum],
+            device=self.device,
+        )
+        kinetic = float(self._sum.numpy()[0])
+        load = 0.0 if self.dead_load is None else -self.dot(self.dead_load, state.u)
+        return Energies(kinetic, self.elastic_energy(state.u), load, self.contact_energy(state.u))
+
+    def add_internal_force(self, u: wp.array, force_out: wp.array) -> None:
+        """Adds the internal forces -dU/du [N] at ``u`` to ``force_out``."""
+        for block in self.blocks:
+            block.launch("force", [u], [force_out])
+
+    def force(self, u: wp.array, force_out: wp.array) -> None:
+        """Overwrites ``force_out`` with all forces but inertia, damping and friction [N]."""
+        if self.dead_load is None:
+            force_out.zero_()
+        else:
+            wp.copy(force_out, self.dead_load)
+        self.add_internal_force(u, force_out)
+        if self.contact is not None:
+            self.contact.add_force(u, force_out)
+
+    def internal_force(self, state: State) -> np.ndarray:
+        """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""
+        out = self.zeros()
+        self.add_internal_force(state.u, out)
+        return out.numpy().astype(np.float64)
+
+    def force_differential(self, state: State, direction: np.ndarray, route: Route = "closed") -> np.ndarray:
+        """The change of the internal force along a direction: df = -K(u) p, with K = d²U/du².
+
+        Args:
+            state: where K is taken.
+            direction: p, (point_count, dim) [m].
+            route: "closed", each material's closed form, matrix-free; "tape", ``wp.Tape`` over the force
+                kernel; "assembled", through the block-sparse K. They agree to rounding, but for an
+                :class:`EnergyMaterial`, whose differential is a central difference.
+
+        Returns:
+            df, (point_count, dim) float64 [N].
+        """
+        from warpfem.linear import tangent_operator
+
+        p = self._device_array(np.asarray(direction), self.types.vector)
+        if p.shape != (self.point_count,):
+            raise SimulationError(f"a direction has shape {(self.point_count, self.dim)}, not {np.shape(direction)}")
+        operator = tangent_operator(self, route, clamped=False, external=False)
+        operator.linearize(state.u, mass_weight=0.0)
+        out = self.zeros()
+        operator.apply(p, out)
+        return -out.numpy().astype(np.float64)
+
+    def element_stiffness(self, u: wp.array | None = None) -> list[np.ndarray]:
+        """Tangent stiffness of each cell at ``u`` (default: at rest).
+
+        Returns:
+            For each block of :attr:`blocks` a float64 array (count, d+1, d, d+1, d) [N/m], indexed by
+            point and component of the force, then of the displacement.
+        """
+        if u is None:
+            u = self.zeros()
+        d, corners = self.dim, self.dim + 1
+        result = []
+        for block in self.blocks:
+            slots = np.arange(block.count * corners**2, dtype=np.int32).reshape(block.count, corners, corners)
+            values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
+            block.launch("stiffness", [u, wp.array(slots, dtype=wp.int32, device=self.device)], [values])
+            entries = values.numpy().astype(np.float64).reshape(block.count, corners, corners, d, d)
+            result.append(entries.transpose(0, 1, 3, 2, 4))
+        return result
+
+    def stresses(self, state: State) -> Stresses:
+        """Deformation gradients and stresses of every cell."""
+        solid = wp.types.matrix(shape=(3, 3), dtype=self.types.scalar)
+        P = np.empty((self.cell_count, 3, 3))
+        F = np.tile(np.eye(3), (self.cell_count, 1, 1))
+        u = state.displacement
+        for block in self.blocks:
+            out = wp.zeros(block.count, dtype=solid, device=self.device)
+            block.launch_stress("stress", [state.u], [out])
+            P[block.index] = out.numpy()
+            corners = u[block.host_cells]
+            edges = corners[:, 1:] - corners[:, :1]
+            B = block.arguments[1].numpy().astype(np.float64)
+            F[block.index, : self.dim, : self.dim] += np.einsum("cki,ckj->cij", edges, B)
+        return Stresses(F, P)
+
+    def tractions(self, state: State, body: int = 0) -> np.ndarray:
+        """Cauchy traction sigma n [Pa] on every boundary face of a body in its current shape.
+
+        Args:
+            state: the state.
+            body: number of the body in the scene.
+
+        Returns:
+            (face_count, dim) float64, in the order of the mesh's ``boundary_faces``.
+        """
+        mesh = self.scene.bodies[body].mesh
+        cells = self.cell_starts[body] + mesh.face_cells
+        stresses = self.stresses(state)
+        normals = np.zeros((len(cells), 3))
+        normals[:, : self.dim] = mesh.boundary_face_normals
+        nominal = np.einsum("fij,fj->fi", stresses.first_piola_kirchhoff[cells], normals)  # per rest area
+        F = stresses.deformation_gradient[cells]
+        inverse_transpose = np.linalg.inv(F).transpose(0, 2, 1)
+        area_ratio = stresses.jacobian[cells] * np.linalg.norm(
+            np.einsum("fij,fj->fi", inverse_transpose, normals), axis=1
+        )
+        return (nominal / area_ratio[:, None])[:, : self.dim]
+
+    def diagnostics(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """J and von Mises stress [Pa] of every cell, float64 arrays (cell_count,)."""
+        jacobian = np.empty(self.cell_count)
+        von_mises = np.empty(self.cell_count)
+        for block in self.blocks:
+            J = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
+            stress = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
+            block.launch_stress("diagnostics", [state.u], [J, stress])
+            jacobian[block.index] = J.numpy()
+            von_mises[block.index] = stress.numpy()
+        return jacobian, von_mises
+
+    def body_of_cell(self, cell: int) -> tuple[Body, int]:
+        """The body that a cell of the model belongs to, and the cell's number in its mesh."""
+        body = int(np.searchsorted(self.cell_starts, cell, side="right")) - 1
+        return self.scene.bodies[body], int(cell - self.cell_starts[body])
+
+    def body_of_point(self, point: int) -> tuple[Body, int]:
+        """The body that a point of the model belongs to, and the point's number in its mesh."""
+        body = int(np.searchsorted(self.point_starts, point, side="right")) - 1
+        return self.scene.bodies[body], int(point - self.point_starts[body])
+
+
+def _lumped_mass(scene: Scene) -> np.ndarray:
+    """Each cell's mass shared equally among its points."""
+    masses = []
+    for body in scene.bodies:
+        mesh = body.mesh
+        share = np.broadcast_to(body.density * mesh.cell_volumes / (mesh.dim + 1), mesh.cell_count)
+        masses.append(np.bincount(mesh.cells.ravel(), np.repeat(share, mesh.dim + 1), mesh.point_count))
+    return np.concatenate(masses)
+
+
+def _dead_load(scene: Scene, mass: np.ndarray, point_starts: np.ndarray) -> np.ndarray | None:
+    """Gravity, point forces and tractions as one force per point [N]; None if there is none of them."""
+    if scene.gravity is None and not any(body.loads for body in scene.bodies):
+        return None
+    load = np.zeros((len(mass), scene.dim))
+    if scene.gravity is not None:
+        load += mass[:, None] * np.asarray(scene.gravity, dtype=np.float64)
+    for body, start in zip(scene.bodies, point_starts, strict=False):
+        for term in body.loads:
+            where = f"body '{body.name}', {type(term).__name__}"
+            if not isinstance(term, PointForce | Traction):
+                raise SceneError(f"body '{body.name}': {term!r} is not a PointForce or Traction")
+            value = np.asarray(term.force if isinstance(term, PointForce) else term.traction)
+            if value.shape != (scene.dim,):
+                raise SceneError(f"{where}: {value.tolist()} must have {scene.dim} components in this scene")
+            try:
+                if isinstance(term, PointForce):
+                    load[start + body.mesh.select_points(term.points)] += value
+                    continue
+                faces = body.mesh.select_faces(term.points)
+            except ValueError as error:
+                raise SceneError(f"{where}: {error}") from None
+            share = np.outer(body.mesh.boundary_face_areas[faces] / scene.dim, value)
+            for corner in range(scene.dim):
+                np.add.at(load, start + body.mesh.boundary_faces[faces, corner], share)
+    return load
+
+
+def device_bytes(arrays: list[wp.array]) -> int:
+    """Bytes that device arrays really hold: a uniform array counts its one entry."""
+    total = 0
+    for array in arrays:
+        stored = array if array.size == 0 or any(array.strides) else array._stored
+        total += prod(stored.shape) * wp.types.type_size_in_bytes(stored.dtype)
+    return total

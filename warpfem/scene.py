@@ -1,0 +1,173 @@
+"""What a person writes: bodies, what acts on them, and how to run the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from warpfem.boundary import Load, Obstacle, Support, Vector
+from warpfem.errors import SceneError
+from warpfem.materials import Material
+from warpfem.mesh import Mesh
+
+if TYPE_CHECKING:
+    from warpfem.solvers.base import Solver
+
+PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
+"""One vector for all points, an array (point_count, dim), or a function of the rest points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """An elastic solid.
+
+    Attributes:
+        name: unique in its scene; names the body's prim in USD.
+        mesh: rest shape [m].
+        material: hyperelastic material.
+        density: mass per rest volume [kg/m^3], > 0; a number, or an array (cell_count,). In 2D bodies are
+            1 m thick.
+        supports: pins and prescribed motions.
+        loads: point forces and tractions.
+        displacement: initial displacement [m]; ``None`` starts at rest shape.
+        velocity: initial velocity [m/s]; ``None`` starts at rest.
+    """
+
+    name: str
+    mesh: Mesh
+    material: Material
+    density: float | np.ndarray = 1000.0
+    supports: Sequence[Support] = ()
+    loads: Sequence[Load] = ()
+    displacement: PointField | None = None
+    velocity: PointField | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise SceneError(f"a body needs a name, not {self.name!r}")
+        if not isinstance(self.mesh, Mesh):
+            raise SceneError(f"body '{self.name}': mesh must be a warpfem.Mesh, not {type(self.mesh).__name__}")
+        if not isinstance(self.material, Material):
+            raise SceneError(
+                f"body '{self.name}': material must be a warpfem material, for example "
+                f"StableNeoHookean(E=1e5, nu=0.45), not {self.material!r}"
+            )
+        density = np.asarray(self.density, dtype=np.float64)
+        if density.ndim > 1 or (density.ndim == 1 and len(density) != self.mesh.cell_count):
+            raise SceneError(
+                f"body '{self.name}': density has shape {density.shape}, but the mesh has {self.mesh.cell_count} cells"
+            )
+        bad = ~(np.isfinite(density) & (density > 0.0))
+        if bad.any():
+            where = f" in cell {int(np.argmax(bad))} ({int(bad.sum())} in all)" if density.ndim else ""
+            raise SceneError(
+                f"body '{self.name}': density must be finite and > 0, not {density.flat[np.argmax(bad)]:g}{where}"
+            )
+        try:
+            self.material.parameter_rows(self.mesh.cell_count)
+        except ValueError as error:
+            raise SceneError(f"body '{self.name}': {error}") from None
+
+    def initial_displacement(self) -> np.ndarray:
+        """Initial displacement, (point_count, dim) float64 [m]."""
+        return self._point_field("displacement", self.displacement)
+
+    def initial_velocity(self) -> np.ndarray:
+        """Initial velocity, (point_count, dim) float64 [m/s]."""
+        return self._point_field("velocity", self.velocity)
+
+    def _point_field(self, name: str, value: PointField | None) -> np.ndarray:
+        shape = self.mesh.points.shape
+        if value is None:
+            return np.zeros(shape)
+        array = np.asarray(value(self.mesh.points) if callable(value) else value, dtype=np.float64)
+        if array.shape not in (shape, shape[1:]):
+            raise SceneError(
+                f"body '{self.name}': initial {name} has shape {array.shape}; expected {shape} or {shape[1:]}"
+            )
+        bad = ~np.isfinite(array)
+        if bad.any():
+            raise SceneError(
+                f"body '{self.name}': initial {name} is not finite at index {int(np.argmax(bad.any(axis=-1)))}"
+            )
+        return np.array(np.broadcast_to(array, shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that a simulation needs to know.
+
+    Attributes:
+        bodies: at least one; all of the same dimension.
+        solver: how time is stepped, for example ``BackwardEuler()``.
+        dt: time step [s]; it is shortened to divide the frame interval. ``"auto"`` takes a safe part of the
+            stability limit for explicit solvers and the frame interval for implicit ones.
+        gravity: acceleration [m/s^2]; ``None`` for none.
+        obstacles: planes, spheres and box walls.
+        damping: mass-proportional damping alpha [1/s], >= 0: the force -alpha m v.
+        fps: frames per second of simulated time, > 0.
+        frames: frames to simulate after the initial one, >= 0.
+        up_axis: "Y" or "Z": which way is up in the USD file.
+        color_by: "von_mises" or "jacobian": the quantity that colours the bodies in the USD file.
+    """
+
+    bodies: Sequence[Body]
+    solver: Solver
+    dt: float | Literal["auto"] = "auto"
+    gravity: Vector | None = None
+    obstacles: Sequence[Obstacle] = ()
+    damping: float = 0.0
+    fps: float = 24.0
+    frames: int = 48
+    up_axis: Literal["Y", "Z"] = "Y"
+    color_by: Literal["von_mises", "jacobian"] = "von_mises"
+    dim: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not self.bodies or not all(isinstance(body, Body) for body in self.bodies):
+            raise SceneError("a scene needs a list of at least one warpfem.Body")
+        dims = {body.mesh.dim for body in self.bodies}
+        if len(dims) != 1:
+            raise SceneError("all bodies of a scene must be 2D, or all 3D")
+        object.__setattr__(self, "dim", dims.pop())
+        names = [body.name for body in self.bodies]
+        for name in names:
+            if names.count(name) > 1:
+                raise SceneError(f"{names.count(name)} bodies are named '{name}': give each its own name")
+        if not callable(getattr(self.solver, "stepper", None)):
+            raise SceneError(f"solver must be a warpfem solver, for example BackwardEuler(), not {self.solver!r}")
+        self._check_number("fps", self.fps, positive=True)
+        self._check_number("damping", self.damping)
+        if self.dt != "auto":
+            self._check_number("dt", self.dt, positive=True)
+        if isinstance(self.frames, bool) or not isinstance(self.frames, (int, np.integer)) or self.frames < 0:
+            raise SceneError(f"frames must be an integer >= 0, not {self.frames!r}")
+        if self.up_axis not in ("Y", "Z"):
+            raise SceneError(f"up_axis must be 'Y' or 'Z', not {self.up_axis!r}")
+        if self.color_by not in ("von_mises", "jacobian"):
+            raise SceneError(f"color_by must be 'von_mises' or 'jacobian', not {self.color_by!r}")
+        if self.gravity is not None:
+            self._check_vector("gravity", self.gravity)
+        for obstacle in self.obstacles:
+            if not isinstance(obstacle, Obstacle):
+                raise SceneError(f"an obstacle must be a Plane, Sphere or BoxWalls, not {obstacle!r}")
+            vector = getattr(obstacle, "point", getattr(obstacle, "center", getattr(obstacle, "lower", ())))
+            self._check_vector(type(obstacle).__name__, vector)
+
+    def _check_number(self, name: str, value: object, positive: bool = False) -> None:
+        number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+        if not number or not np.isfinite(value) or value < 0.0 or (positive and value == 0.0):  # type: ignore
+            raise SceneError(f"{name} must be a finite number {'> 0' if positive else '>= 0'}, not {value!r}")
+
+    def _check_vector(self, name: str, value: Vector) -> None:
+        try:
+            vector = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise SceneError(f"{name} must be a vector of {self.dim} numbers, not {value!r}") from None
+        if vector.shape != (self.dim,) or not np.isfinite(vector).all():
+            raise SceneError(
+                f"{name} must be a finite vector of length {self.dim} in a {self.dim}D scene, not {value!r}"
+            )

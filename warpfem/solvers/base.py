@@ -1,0 +1,80 @@
+"""What a solver is: immutable configuration that makes a stepper for a model."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import warp as wp
+
+from warpfem.errors import SimulationError
+from warpfem.model import Model, State
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step did.
+
+    Attributes:
+        newton_iterations: linear systems solved.
+        cg_iterations: iterations of conjugate gradients over all of them.
+        residual: unbalanced force over the largest of the forces acting, at the end; 0 for explicit steps,
+            the linear solver's relative residual for linearised ones.
+        converged: whether the residual met the tolerance.
+        note: how the step ended, if it did not converge.
+    """
+
+    newton_iterations: int = 0
+    cg_iterations: int = 0
+    residual: float = 0.0
+    converged: bool = True
+    note: str = ""
+
+
+class Stepper(ABC):
+    """Advances states of one model. Holds the work arrays, never the state."""
+
+    model: Model
+
+    @abstractmethod
+    def step(self, state: State, dt: float) -> StepReport:
+        """Advances ``state`` in place by ``dt`` [s].
+
+        Raises:
+            SimulationError: if the step cannot be taken; the state is then as it was before.
+        """
+
+    @abstractmethod
+    def arrays(self) -> list[wp.array]:
+        """The device arrays held."""
+
+    def stable_dt(self) -> float | None:
+        """The largest stable time step at rest [s], or ``None`` if there is no such limit."""
+        return None
+
+
+class Solver(ABC):
+    """A time integration scheme with its settings."""
+
+    name: ClassVar[str]
+    order: ClassVar[int]
+    """Order of accuracy in dt of the positions at a fixed time."""
+
+    @abstractmethod
+    def stepper(self, model: Model) -> Stepper:
+        """A stepper for ``model``."""
+
+
+def require_finite(model: Model, vector: wp.array, what: str, time: float) -> None:
+    """Raises SimulationError that names the first point where ``vector`` is not finite, and its cell's J."""
+    bad = ~np.isfinite(vector.numpy()).all(axis=1)
+    if not bad.any():
+        return
+    body, point = model.body_of_point(int(np.argmax(bad)))
+    raise SimulationError(
+        f"t = {time:.6g} s: {what} of point {point} of body '{body.name}' is not finite "
+        f"({int(bad.sum())} points in all). A smaller dt, a softer start or a material that bears inversion "
+        "(StableNeoHookean) may help"
+    )

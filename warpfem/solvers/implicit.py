@@ -1,0 +1,376 @@
+"""Backward Euler: each step minimises the incremental potential by Newton's method."""
+
+import functools
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Literal
+
+import numpy as np
+import warp as wp
+
+from warpfem.dtypes import types
+from warpfem.errors import SceneError, SimulationError
+from warpfem.linear import ConjugateGradients, LinearStatus, tangent_operator
+from warpfem.model import Model, Route, State
+from warpfem.points import CHUNK, chunks
+from warpfem.solvers.base import Solver, Stepper, StepReport, require_finite
+
+
+@functools.cache
+def _implicit_kernels(dim: int, dtype: str) -> SimpleNamespace:
+    t = types(dim, dtype)
+    vector, matrix, scalar = t.vector, t.matrix, t.scalar
+    module = f"warpfem.implicit_{dim}_{dtype}"
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_scaled(
+        a: wp.array(dtype=vector),
+        factor: scalar,
+        b: wp.array(dtype=vector),
+        sum_out: wp.array(dtype=vector),
+    ):
+        """Writes a + factor b."""
+        i = wp.tid()
+        sum_out[i] = a[i] + factor * b[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def free_flight(
+        predicted: wp.array(dtype=vector),
+        load: wp.array(dtype=vector),
+        inverse_mass: wp.array(dtype=scalar),
+        inverse_weight: scalar,
+        u_out: wp.array(dtype=vector),
+    ):
+        """Writes where dead loads alone would take the points."""
+        i = wp.tid()
+        u_out[i] = predicted[i] + (inverse_weight * inverse_mass[i]) * load[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def inertia_energy(
+        mass: wp.array(dtype=scalar),
+        weight: scalar,
+        predicted: wp.array(dtype=vector),
+        u: wp.array(dtype=vector),
+        energy_out: wp.array(dtype=wp.float64),
+    ):
+        """Adds weight/2 |u - predicted|^2_M."""
+        first = wp.tid() * CHUNK
+        last = wp.min(first + CHUNK, u.shape[0])
+        total = wp.float64(0.0)
+        for i in range(first, last):
+            d = u[i] - predicted[i]
+            square = wp.float64(0.0)
+            for k in range(dim):
+                square += wp.float64(d[k]) * wp.float64(d[k])
+            total += wp.float64(mass[i]) * square
+        wp.atomic_add(energy_out, 0, wp.float64(0.5) * wp.float64(weight) * total)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def inertia_force(
+        mass: wp.array(dtype=scalar),
+        weight: scalar,
+        predicted: wp.array(dtype=vector),
+        u: wp.array(dtype=vector),
+        force_out: wp.array(dtype=vector),
+    ):
+        """Writes -weight M (u - predicted)."""
+        i = wp.tid()
+        force_out[i] = (weight * mass[i]) * (predicted[i] - u[i])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def rounding(
+        inverse_diagonal: wp.array(dtype=matrix),
+        epsilon: scalar,
+        u: wp.array(dtype=vector),
+        force_out: wp.array(dtype=vector),
+    ):
+        """Writes the change of force that one rounding of u makes."""
+        i = wp.tid()
+        stiffness = scalar(float(dim)) / wp.trace(inverse_diagonal[i])
+        force_out[i] = (epsilon * stiffness) * u[i]
+
+    return SimpleNamespace(
+        add_scaled=add_scaled,
+        free_flight=free_flight,
+        inertia_energy=inertia_energy,
+        inertia_force=inertia_force,
+        rounding=rounding,
+    )
+
+
+class _BackwardEulerStepper(Stepper):
+    """The unknown is the displacement u at the end of the step; the incremental potential is
+
+    Phi(u) = w/2 |u - u~|^2_M + U(u) - f_dead . u + contact(u) + friction(u),
+
+    with w = (1 + alpha dt) / dt^2 and u~ = u_t + dt v_t / (1 + alpha dt), alpha the damping.
+    """
+
+    def __init__(self, model: Model, config: "BackwardEuler") -> None:
+        self.model = model
+        self.config = config
+        self.kernels = _implicit_kernels(model.dim, model.dtype)
+        self.operator = tangent_operator(model, config.differential, clamped=config.hessian == "clamped")
+        self.cg = ConjugateGradients(model)
+        self._u, self._trial, self._predicted, self._force, self._part, self._direction = (
+            model.zeros() for _ in range(6)
+        )
+        self._sum = wp.zeros(1, dtype=wp.float64, device=model.device)
+
+    def arrays(self) -> list[wp.array]:
+        own = [self._u, self._trial, self._predicted, self._force, self._part, self._direction, self._sum]
+        return [*own, *self.cg.arrays(), *self.operator.arrays()]
+
+    def step(self, state: State, dt: float) -> StepReport:
+        if dt <= 0.0:
+            raise SimulationError(f"dt must be > 0, not {dt}")
+        model = self.model
+        time = state.time + dt
+        damping = model.scene.damping
+        self._weight = (1.0 + damping * dt) / dt**2
+        self._start, self._dt = state.u, dt
+        self._launch("add_scaled", [state.u, dt / (1.0 + damping * dt), state.v], [self._predicted])
+        if model.supports is not None:
+            model.supports.advance(time, dt)
+        if model.contact is not None:
+            model.contact.begin_friction(state.u)
+        report = self._newton(state, time) if self.config.max_iterations > 1 else self._linearised(state, time)
+        # v = (u - u_t) / dt, then u
+        self._launch("add_scaled", [self._u, -1.0, state.u], [self._part])
+        state.v.zero_()
+        self._launch("add_scaled", [state.v, 1.0 / dt, self._part], [state.v])
+        wp.copy(state.u, self._u)
+        if model.supports is not None:
+            model.supports.hold(state.u, state.v)
+        state.time = time
+        state.revision += 1
+        return report
+
+    # --- one linear system: the lecture's step ----------------------------------------------------------
+
+    def _linearised(self, state: State, time: float) -> StepReport:
+        wp.copy(self._u, state.u)
+        self._hold(self._u)
+        self._unbalanced_force(self._u)
+        require_finite(self.model, self._force, "the force", time)
+        self._linearize(self._u)
+        result = self._solve(self.config.linear_tolerance)
+        self._launch("add_scaled", [self._u, 1.0, self._direction], [self._u])
+        require_finite(self.model, self._u, "the displacement", time)
+        converged = result.status is LinearStatus.CONVERGED
+        note = "" if converged else f"conjugate gradients {result.status.value}"
+        return StepReport(1, result.iterations, result.residual, converged, note)
+
+    # --- Newton's method --------------------------------------------------------------------------------
+
+    def _newton(self, state: State, time: float) -> StepReport:
+        config, model = self.config, self.model
+        potential = self._choose_start(state)
+        if not np.isfinite(potential):
+            raise SimulationError(self._infinite_energy(state, time))
+        cg_iterations = 0
+        note = f"stopped after {config.max_iterations} Newton iterations"
+        relative = np.inf
+        for iteration in range(config.max_iterations + 1):
+            residual, scale = self._unbalanced_force(self._u)
+            if not np.isfinite(residual):
+                require_finite(model, self._force, "the force", time)
+            relative = residual / scale if scale > 0.0 else 0.0
+            if relative <= config.tolerance:
+                return StepReport(iteration, cg_iterations, relative)
+            if iteration == config.max_iterations:
+                break
+            self._linearize(self._u)
+            if residual <= self._rounding_force(self._u):
+                return StepReport(iteration, cg_iterations, relative, True, "resolved to rounding")
+            forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
+            result = self._solve(forcing)
+            cg_iterations += result.iterations
+            found = self._line_search(potential) if config.line_search else self._full_step()
+            if found is None:
+                note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
+                break
+            potential = found
+        return StepReport(iteration, cg_iterations, relative, False, note)
+
+    def _choose_start(self, state: State) -> float:
+        """Starts from the old state or from free flight, whichever has less potential."""
+        self._prepare_flight(self._trial)
+        self._hold(self._trial)
+        wp.copy(self._u, state.u)
+        self._hold(self._u)
+        still, flying = self._potential(self._u)[0], self._potential(self._trial)[0]
+        if flying < still or not np.isfinite(still):
+            wp.copy(self._u, self._trial)
+            return flying
+        return still
+
+    def _prepare_flight(self, u_out: wp.array) -> None:
+        model = self.model
+        if model.dead_load is None:
+            wp.copy(u_out, self._predicted)
+        else:
+            arguments = [self._predicted, model.dead_load, model.inverse_mass, 1.0 / self._weight]
+            self._launch("free_flight", arguments, [u_out])
+
+    def _line_search(self, potential: float) -> float | None:
+        """Backtracks from the full step until the potential falls enough (Armijo); None if it never does."""
+        slope = -self.model.dot(self._force, self._direction)
+        length = 1.0
+        for _ in range(40):
+            self._launch("add_scaled", [self._u, length, self._direction], [self._trial])
+            value, size = self._potential(self._trial)
+            slack = 4.0 * self.model.types.epsilon * size
+            if value <= potential + 1e-4 * length * slope + slack:
+                self._u, self._trial = self._trial, self._u
+                return value
+            length *= 0.5
+        return None
+
+    def _full_step(self) -> float:
+        self._launch("add_scaled", [self._u, 1.0, self._direction], [self._u])
+        return np.inf
+
+    # --- terms ------------------------------------------------------------------------------------------
+
+    def _launch(self, name: str, inputs: list, outputs: list) -> None:
+        kernel, model = getattr(self.kernels, name), self.model
+        wp.launch(kernel, model.point_count, inputs=inputs, outputs=outputs, device=model.device)
+
+    def _hold(self, u: wp.array) -> None:
+        if self.model.supports is not None:
+            self.model.supports.hold(u, self._part)  # the rates go to a work array
+
+    def _potential(self, u: wp.array) -> tuple[float, float]:
+        """Phi(u) and the sum of the sizes of its rounded terms."""
+        model, total = self.model, self._sum
+        total.zero_()
+        wp.launch(
+            self.kernels.inertia_energy,
+            chunks(model.point_count),
+            inputs=[model.mass, self._weight, self._predicted, u],
+            outputs=[total],
+            device=model.device,
+        )
+        for block in model.blocks:
+            block.launch("energy", [u], [total])
+        if model.contact is not None:
+            model.contact.add_energy(u, total)
+            model.contact.add_friction_energy(self._start, self._dt, u, total)
+        size = float(total.numpy()[0])
+        load = 0.0 if model.dead_load is None else model.dot(model.dead_load, u)
+        return size - load, abs(size)
+
+    def _unbalanced_force(self, u: wp.array) -> tuple[float, float]:
+        """Writes -dPhi/du to ``_force``, zero where held; returns its norm and that of the largest part."""
+        model, force, part = self.model, self._force, self._part
+        self._launch("inertia_force", [model.mass, self._weight, self._predicted, u], [force])
+        sizes = [model.dot(force, force)]
+        part.zero_()
+        model.add_internal_force(u, part)
+        sizes.append(model.dot(part, part))
+        self._launch("add_scaled", [force, 1.0, part], [force])
+        if model.dead_load is not None:
+            sizes.append(model.dot(model.dead_load, model.dead_load))
+            self._launch("add_scaled", [force, 1.0, model.dead_load], [force])
+        if model.contact is not None:
+            model.contact.add_force(u, force)
+            model.contact.add_friction_force(self._start, self._dt, u, force)
+        if model.supports is not None:
+            model.supports.project(force)
+        return float(np.sqrt(model.dot(force, force))), float(np.sqrt(max(sizes)))
+
+    def _linearize(self, u: wp.array) -> None:
+        friction = None if self.model.contact is None else (self._start, self._dt)
+        self.operator.linearize(u, self._weight, friction=friction, precondition=True)
+
+    def _solve(self, tolerance: float):
+        return self.cg.solve(
+            self.operator,
+            self._force,
+            self._direction,
+            tolerance=tolerance,
+            max_iterations=self.config.linear_iterations,
+        )
+
+    def _rounding_force(self, u: wp.array) -> float:
+        """The norm of the change of force that one rounding of u makes: no residual can be told from it."""
+        arguments = [self.operator.inverse_diagonal, self.model.types.epsilon, u]
+        self._launch("rounding", arguments, [self._part])
+        if self.model.supports is not None:
+            self.model.supports.project(self._part)
+        return float(np.sqrt(self.model.dot(self._part, self._part)))
+
+    def _infinite_energy(self, state: State, time: float) -> str:
+        jacobian, _ = self.model.diagnostics(state)
+        cell = int(np.argmin(jacobian))
+        body, own = self.model.body_of_cell(cell)
+        return (
+            f"t = {time:.6g} s: the step starts from infinite energy; cell {own} of body '{body.name}' has "
+            f"J = {jacobian[cell]:.4g}. Start from a state with J > 0, move supports more slowly, or take "
+            "StableNeoHookean, which bears inversion"
+        )
+
+
+@dataclass(frozen=True)
+class BackwardEuler(Solver):
+    """Backward Euler, v = (u - u_t)/dt and M (v - v_t)/dt = f(u) at the end of the step.
+
+    By default each step is solved to ``tolerance`` by Newton's method with line search on the incremental
+    potential. :meth:`linearised` is the lecture's single linear solve.
+
+    Attributes:
+        tolerance: largest accepted norm of the unbalanced force, relative to the largest of inertia,
+            internal force and load; it does not depend on units, dt or mesh size.
+        max_iterations: Newton iterations; 1 takes the linearised step.
+        hessian: "clamped" makes each element's stiffness positive semi-definite by setting negative
+            eigenvalues to zero (Teran et al. 2005); "exact" leaves it, and directions of negative curvature
+            end the linear solve. Materials that are not isotropic always use "exact".
+        differential: route of the stiffness product: "assembled", "closed" or "tape".
+        line_search: whether steps are shortened until the potential falls.
+        linear_tolerance: relative residual of the linear solve of a linearised step.
+        linear_iterations: limit of conjugate gradients for one linear solve.
+    """
+
+    tolerance: float = 1e-4
+    max_iterations: int = 50
+    hessian: Literal["clamped", "exact"] = "clamped"
+    differential: Route = "assembled"
+    line_search: bool = True
+    linear_tolerance: float = 1e-5
+    linear_iterations: int = 2000
+
+    name = "backward_euler"
+    order = 1
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "linear_tolerance"):
+            value = getattr(self, name)
+            if not (isinstance(value, float | int) and 0.0 < value < 1.0):
+                raise SceneError(f"BackwardEuler: {name} must be in (0, 1), not {value!r}")
+        for name in ("max_iterations", "linear_iterations"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise SceneError(f"BackwardEuler: {name} must be an integer >= 1, not {value!r}")
+        if self.hessian not in ("clamped", "exact"):
+            raise SceneError(f"BackwardEuler: hessian must be 'clamped' or 'exact', not {self.hessian!r}")
+        if self.differential not in ("assembled", "closed", "tape"):
+            raise SceneError(
+                f"BackwardEuler: differential must be 'assembled', 'closed' or 'tape', not {self.differential!r}"
+            )
+        if self.differential == "tape" and self.hessian == "clamped":
+            raise SceneError("BackwardEuler: the tape cannot clamp: take hessian='exact'")
+
+    @classmethod
+    def linearised(cls, differential: Route = "assembled", linear_tolerance: float = 1e-5) -> "BackwardEuler":
+        """One linear solve a step: (M + dt^2 K(u_t)) v = M v_t + dt f(u_t) (Hu 2020, eq. 11)."""
+        return cls(
+            max_iterations=1,
+            hessian="exact",
+            differential=differential,
+            line_search=False,
+            linear_tolerance=linear_tolerance,
+        )
+
+    def stepper(self, model: Model) -> Stepper:
+        return _BackwardEulerStepper(model, self)

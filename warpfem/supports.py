@@ -1,0 +1,189 @@
+"""Pins and prescribed motions on the device: which components are held, and where."""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from warpfem.boundary import Pin, PrescribedMotion, Support
+from warpfem.dtypes import types
+from warpfem.errors import SceneError
+from warpfem.scene import Body
+
+
+@functools.cache
+def support_kernels(dim: int, dtype: str) -> SimpleNamespace:
+    """The kernels ``hold``, ``project`` and ``hold_rows``."""
+    t = types(dim, dtype)
+    vector, matrix, scalar = t.vector, t.matrix, t.scalar
+    module = f"warpfem.supports_{dim}_{dtype}"
+
+    @wp.kernel(module=module, enable_backward=False)
+    def hold(
+        points: wp.array(dtype=wp.int32),
+        held: wp.array(dtype=vector),
+        target: wp.array(dtype=vector),
+        target_rate: wp.array(dtype=vector),
+        u_out: wp.array(dtype=vector),
+        v_out: wp.array(dtype=vector),
+    ):
+        """Puts the held components (held = 1) at their target."""
+        k = wp.tid()
+        i = points[k]
+        one = vector(scalar(1.0))
+        u_out[i] = wp.cw_mul(one - held[k], u_out[i]) + wp.cw_mul(held[k], target[k])
+        v_out[i] = wp.cw_mul(one - held[k], v_out[i]) + wp.cw_mul(held[k], target_rate[k])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def project(points: wp.array(dtype=wp.int32), held: wp.array(dtype=vector), vector_out: wp.array(dtype=vector)):
+        """Sets the held components of a vector to zero."""
+        k = wp.tid()
+        i = points[k]
+        vector_out[i] = wp.cw_mul(vector(scalar(1.0)) - held[k], vector_out[i])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def hold_rows(
+        points: wp.array(dtype=wp.int32),
+        held: wp.array(dtype=vector),
+        row_starts: wp.array(dtype=wp.int32),
+        diagonal: wp.array(dtype=wp.int32),
+        blocks_out: wp.array(dtype=matrix),
+    ):
+        """Replaces the held rows of a block matrix by those of the identity."""
+        k = wp.tid()
+        i = points[k]
+        keep = wp.diag(vector(scalar(1.0)) - held[k])
+        for slot in range(row_starts[i], row_starts[i + 1]):
+            blocks_out[slot] = keep * blocks_out[slot]
+        # the columns of the diagonal block too, so that it can be inverted
+        blocks_out[diagonal[i]] = blocks_out[diagonal[i]] * keep + wp.diag(held[k])
+
+    return SimpleNamespace(hold=hold, project=project, hold_rows=hold_rows)
+
+
+@dataclass
+class _Moving:
+    body: str
+    rows: np.ndarray  # of this motion's points among the held points
+    held: np.ndarray  # (k, dim) bool
+    rest: np.ndarray  # (k, dim)
+    motion: Callable[[np.ndarray, float], np.ndarray]
+
+    def displacement(self, time: float) -> np.ndarray:
+        x = np.asarray(self.motion(self.rest.copy(), time), dtype=np.float64)
+        if x.shape != self.rest.shape:
+            raise SceneError(
+                f"body '{self.body}': the prescribed motion returned shape {x.shape} at t = {time:g} s; "
+                f"expected {self.rest.shape}"
+            )
+        bad = ~np.isfinite(x).all(axis=1)
+        if bad.any():
+            raise SceneError(
+                f"body '{self.body}': the prescribed motion is not finite at t = {time:g} s "
+                f"for its point {int(np.argmax(bad))} ({int(bad.sum())} in all)"
+            )
+        return x - self.rest
+
+
+class Supports:
+    """All held components of a scene.
+
+    Attributes:
+        count: held points.
+        points: (count,) int32 device array.
+        held: (count,) vectors of 1 (held) and 0 (free).
+    """
+
+    def __init__(self, bodies: Sequence[Body], starts: Sequence[int], dim: int, dtype: str, device) -> None:
+        self.types = types(dim, dtype)
+        self.kernels = support_kernels(dim, dtype)
+        self.device = device
+        claims: dict[tuple[int, int], Support] = {}
+        motions = []
+        for body, start in zip(bodies, starts, strict=True):
+            for support in body.supports:
+                if not isinstance(support, Pin | PrescribedMotion):
+                    raise SceneError(f"body '{body.name}': {support!r} is not a Pin or PrescribedMotion")
+                try:
+                    selected = body.mesh.select_points(support.points)
+                except ValueError as error:
+                    raise SceneError(f"body '{body.name}', {type(support).__name__}: {error}") from None
+                axes = self._axes(body, support)
+                for point in selected:
+                    for axis in axes:
+                        other = claims.setdefault((start + int(point), axis), support)
+                        if other is not support and not (isinstance(other, Pin) and isinstance(support, Pin)):
+                            raise SceneError(
+                                f"body '{body.name}': component {axis} of point {point} is claimed by a "
+                                f"{type(other).__name__} and by a {type(support).__name__}: choose one"
+                            )
+                if isinstance(support, PrescribedMotion):
+                    motions.append((body, start, selected, axes, support.motion))
+        self.host_points = np.unique(np.array([point for point, _ in claims], dtype=np.int32))
+        self.count = len(self.host_points)
+        held = np.zeros((self.count, dim))
+        index, component = np.array(list(claims), dtype=np.int64).reshape(-1, 2).T
+        held[np.searchsorted(self.host_points, index), component] = 1.0
+        self.points = wp.array(self.host_points, dtype=wp.int32, device=device)
+        self.held = wp.array(held, dtype=self.types.vector, device=device)
+        self._target = np.zeros((self.count, dim))
+        self._moving: list[_Moving] = []
+        for body, start, selected, axes, motion in motions:
+            mask = np.zeros((len(selected), dim), dtype=bool)
+            mask[:, list(axes)] = True
+            rows = np.searchsorted(self.host_points, start + selected)
+            self._moving.append(_Moving(body.name, rows, mask, body.mesh.points[selected], motion))
+        self.target = wp.zeros(self.count, dtype=self.types.vector, device=device)
+        self.target_rate = wp.zeros(self.count, dtype=self.types.vector, device=device)
+
+    @staticmethod
+    def _axes(body: Body, support: Pin | PrescribedMotion) -> tuple[int, ...]:
+        dim = body.mesh.dim
+        axes = tuple(range(dim)) if support.axes is None else tuple(support.axes)
+        if not axes or any(axis not in range(dim) for axis in axes):
+            raise SceneError(
+                f"body '{body.name}', {type(support).__name__}: axes {support.axes!r} must be among 0..{dim - 1}"
+            )
+        return axes
+
+    @property
+    def moving(self) -> bool:
+        """Whether any held point moves."""
+        return bool(self._moving)
+
+    def advance(self, time: float, dt: float) -> None:
+        """Sets the targets to those at ``time`` and their rates to the mean over the last ``dt``."""
+        if not self._moving:
+            return
+        target = self._target
+        rate = np.zeros_like(target)
+        for part in self._moving:
+            now = part.displacement(time)
+            mean_rate = (now - part.displacement(time - dt)) / dt if dt > 0.0 else np.zeros_like(now)
+            target[part.rows] = np.where(part.held, now, target[part.rows])
+            rate[part.rows] = np.where(part.held, mean_rate, rate[part.rows])
+        self.target.assign(target.astype(self.types.numpy))
+        self.target_rate.assign(rate.astype(self.types.numpy))
+
+    def hold(self, u: wp.array, v: wp.array) -> None:
+        """Puts the held components of ``u`` and ``v`` at their targets."""
+        wp.launch(
+            self.kernels.hold,
+            self.count,
+            inputs=[self.points, self.held, self.target, self.target_rate],
+            outputs=[u, v],
+            device=self.device,
+        )
+
+    def project(self, vector: wp.array) -> None:
+        """Sets the held components of ``vector`` to zero."""
+        wp.launch(
+            self.kernels.project,
+            self.count,
+            inputs=[self.points, self.held],
+            outputs=[vector],
+            device=self.device,
+        )
