@@ -26,6 +26,14 @@ _USD = {".usd", ".usda", ".usdc", ".usdz"}
 _LINEAR = {2: "triangle", 3: "tetra"}
 _ENTITIES = ("point", "curve", "surface", "volume")  # Gmsh's words, by dimension
 
+# What a whole file has: without it, meshio reads on for ever or takes a part for the whole.
+_MARKS = {
+    ".msh": rb"^\$End\w+\s*\Z",
+    ".mdpa": rb"^\s*End \w+\s*\Z",
+    ".ply": rb"^end_header\s",
+    ".off": rb"^\s*\d+\s+\d+\s+\d+\s",
+}
+
 MAX_CLOSED_AREA_RATIO = 1.1
 """A mesh whose boundary is larger than the given surface by more than this had holes to close."""
 
@@ -178,17 +186,18 @@ def _read_file(path: Path) -> Any:
         import meshio
     except ImportError as error:
         raise MissingExtraError(f"reading {path.name}", error.name or "meshio", "mesh") from error
-    if path.suffix.lower() == ".msh" and not re.search(rb"\n\$End\w+\s*$", path.read_bytes()[-99:]):
-        raise MeshError("the file is truncated: it does not end with the end of a section")
+    mark = _MARKS.get(path.suffix.lower())
+    if mark and not re.search(mark, path.read_bytes(), re.MULTILINE):
+        raise MeshError("the file is truncated, or not of the format that its name says")
     printed = io.StringIO()
     try:
         with redirect_stdout(printed), redirect_stderr(printed):
             file = meshio.read(path)
     except (Exception, SystemExit) as error:  # meshio raises anything on damaged files, and may exit
         reason = " ".join(printed.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise MeshError(f"cannot be read, so it is damaged or of an unknown format ({reason})") from error
-    if printed.getvalue():
-        warnings.warn(f"{path}: meshio says: {' '.join(printed.getvalue().split())}", stacklevel=4)
+        raise MeshError(f"the file is damaged or of an unknown format ({reason})") from error
+    if remarks := " ".join(printed.getvalue().split()):
+        warnings.warn(f"{path}: meshio says: {remarks}", stacklevel=3)
     return file
 
 
