@@ -133,14 +133,15 @@ def log1p_deficit(y: Any):
         return y - wp.log(type(y)(1.0) + y)
     z = y / (type(y)(2.0) + y)
     w = z * z
-    series = type(y)(1.0 / 17.0)
-    series = series * w + type(y)(1.0 / 15.0)
-    series = series * w + type(y)(1.0 / 13.0)
-    series = series * w + type(y)(1.0 / 11.0)
-    series = series * w + type(y)(1.0 / 9.0)
-    series = series * w + type(y)(1.0 / 7.0)
-    series = series * w + type(y)(1.0 / 5.0)
-    series = series * w + type(y)(1.0 / 3.0)
+    one = type(y)(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
+    series = one / type(y)(17.0)
+    series = series * w + one / type(y)(15.0)
+    series = series * w + one / type(y)(13.0)
+    series = series * w + one / type(y)(11.0)
+    series = series * w + one / type(y)(9.0)
+    series = series * w + one / type(y)(7.0)
+    series = series * w + one / type(y)(5.0)
+    series = series * w + one / type(y)(3.0)
     return y * z - type(y)(2.0) * z * w * series
 
 
