@@ -1,1 +1,84 @@
-"""warpfem: finite element simulation of elastic solids on NVIDIA Warp."""
+"""warpfem: finite element simulation of elastic solids on NVIDIA Warp, stored as USD animations.
+
+import warpfem as wf
+
+mesh = wf.Mesh.box(size=(1, 1, 1), cells=(8, 8, 8), origin=(0, 0.5, 0))
+body = wf.Body("jelly", mesh, wf.StableNeoHookean(E=1e5, nu=0.45), density=1000)
+scene = wf.Scene([body], wf.BackwardEuler(), gravity=(0, -9.81, 0), obstacles=[wf.Plane((0, 0, 0), (0, 1, 0))])
+wf.run(scene, "jelly.usdc")
+"""
+
+__version__ = "0.1.0"
+
+from warpfem.boundary import BoxWalls, Pin, Plane, PointForce, PrescribedMotion, Sphere, Traction
+from warpfem.errors import (
+    MaterialError,
+    MeshError,
+    MissingExtraError,
+    OutputError,
+    SceneError,
+    SimulationError,
+    WarpfemError,
+)
+from warpfem.materials import (
+    MATERIALS,
+    EnergyMaterial,
+    FixedCorotated,
+    LinearElasticity,
+    NeoHookean,
+    StableNeoHookean,
+    StVenantKirchhoff,
+)
+from warpfem.mesh import Mesh
+from warpfem.meshing import read_mesh, read_surface, tetrahedralize
+from warpfem.model import Energies, Model, State, Stresses
+from warpfem.moduli import ElasticModuli, elastic_moduli
+from warpfem.record import record, run
+from warpfem.scene import Body, Scene
+from warpfem.simulation import Frame, Simulation, Summary
+from warpfem.solvers import SOLVERS, BackwardEuler, SymplecticEuler, VelocityVerlet
+
+__all__ = [
+    "MATERIALS",
+    "SOLVERS",
+    "BackwardEuler",
+    "Body",
+    "BoxWalls",
+    "ElasticModuli",
+    "Energies",
+    "EnergyMaterial",
+    "FixedCorotated",
+    "Frame",
+    "LinearElasticity",
+    "MaterialError",
+    "Mesh",
+    "MeshError",
+    "MissingExtraError",
+    "Model",
+    "NeoHookean",
+    "OutputError",
+    "Pin",
+    "Plane",
+    "PointForce",
+    "PrescribedMotion",
+    "Scene",
+    "SceneError",
+    "Simulation",
+    "SimulationError",
+    "Sphere",
+    "StVenantKirchhoff",
+    "StableNeoHookean",
+    "State",
+    "Stresses",
+    "Summary",
+    "SymplecticEuler",
+    "Traction",
+    "VelocityVerlet",
+    "WarpfemError",
+    "elastic_moduli",
+    "read_mesh",
+    "read_surface",
+    "record",
+    "run",
+    "tetrahedralize",
+]

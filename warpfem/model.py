@@ -290,6 +290,16 @@ class Model:
             self.supports.hold(state.u, state.v)
         return state
 
+    def arrays(self) -> list[wp.array]:
+        """The device arrays held."""
+        own = [self.mass, self.inverse_mass, *(array for block in self.blocks for array in block.arguments)]
+        if self.dead_load is not None:
+            own.append(self.dead_load)
+        for term in (self.supports, self.contact):
+            if term is not None:
+                own += term.arrays()
+        return own
+
     def zeros(self) -> wp.array:
         """A new vector of zeros per point."""
         return wp.zeros(self.point_count, dtype=self.types.vector, device=self.device)

@@ -149,6 +149,10 @@ class Supports:
             )
         return axes
 
+    def arrays(self) -> list[wp.array]:
+        """The device arrays held."""
+        return [self.points, self.held, self.target, self.target_rate]
+
     @property
     def moving(self) -> bool:
         """Whether any held point moves."""

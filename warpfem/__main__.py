@@ -1,0 +1,7 @@
+"""``python -m warpfem``."""
+
+import sys
+
+from warpfem.cli import main
+
+sys.exit(main())

@@ -1,0 +1,246 @@
+"""The command ``warpfem``."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import platform
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import warpfem
+from warpfem.errors import OutputError, SimulationError, WarpfemError
+from warpfem.scene import Scene
+from warpfem.simulation import Frame, Simulation, Summary
+
+OK, FAILED, WRONG_USE = 0, 1, 2
+
+EXTRAS = {
+    "meshio": "mesh",
+    "pytetwild": "tet",
+    "matplotlib": "plot",
+    "pillow": "plot",
+    "tqdm": "progress",
+}
+"""Optional packages and the extra that brings them."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns 0, 1 for a failed run or 2 for wrong use."""
+    arguments = _parser().parse_args(argv)
+    try:
+        return arguments.command(arguments)
+    except SimulationError as error:
+        return _fail(error, FAILED)
+    except WarpfemError as error:
+        return _fail(error, WRONG_USE)
+
+
+def _fail(error: Exception, code: int) -> int:
+    print(f"warpfem: {error}", file=sys.stderr)
+    for note in getattr(error, "__notes__", ()):
+        print(f"warpfem: {note}", file=sys.stderr)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="warpfem", description="Simulates elastic solids by finite elements and stores the animation in USD."
+    )
+    parser.add_argument("--version", action="version", version=f"warpfem {warpfem.__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="run a scene file and store the animation", description=_run.__doc__)
+    _scene_options(run)
+    run.add_argument("--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.usdc)")
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    run.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else")
+    run.set_defaults(command=_run)
+
+    explain = commands.add_parser(
+        "explain", help="say what a scene requires, and so what is modelled", description=_explain.__doc__
+    )
+    _scene_options(explain)
+    explain.set_defaults(command=_explain)
+
+    preview = commands.add_parser("preview", help="draw a run to PNG or GIF", description=_preview.__doc__)
+    preview.add_argument("file", type=Path, metavar="FILE", help="a USD file that warpfem wrote")
+    preview.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="F", help=".png (a sheet of frames) or .gif (the motion)"
+    )
+    preview.set_defaults(command=_preview)
+
+    info = commands.add_parser("info", help="print versions and devices", description=_info.__doc__)
+    info.set_defaults(command=_info)
+    return parser
+
+
+def _scene_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
+    parser.add_argument("--frames", type=int, metavar="N", help="frames to simulate after the initial one")
+    parser.add_argument("--fps", type=float, metavar="N", help="frames per second of simulated time")
+    parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
+    parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="default: float32")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="settings",
+        metavar="NAME=VALUE",
+        help="set a parameter of the scene; may be repeated",
+    )
+
+
+def _load(arguments: argparse.Namespace) -> Scene:
+    from warpfem.scene_file import load_scene
+
+    settings = {}
+    for text in arguments.settings:
+        name, equals, value = text.partition("=")
+        if not equals or not name.isidentifier():
+            raise WarpfemError(f"--set takes NAME=VALUE, for example --set cells=16, not '{text}'")
+        settings[name] = value
+    scene = load_scene(arguments.scene, settings)
+    given = {"frames": arguments.frames, "fps": arguments.fps}
+    return replace(scene, **{name: value for name, value in given.items() if value is not None})
+
+
+def _quiet_warp() -> None:
+    """Keeps Warp from reporting each module it loads, and that there is no CUDA driver."""
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Runs a scene file and stores the animation in a USD file, frame by frame."""
+    _quiet_warp()
+    scene = _load(arguments)
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
+    if arguments.out is None:
+        try:
+            out.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{out.parent} cannot be made ({error.strerror}): choose a file with --out") from None
+    say = not (arguments.quiet or arguments.json)
+    if say:
+        print(f"{arguments.scene}: preparing (the first run of a scene compiles its kernels)", file=sys.stderr)
+    simulation = Simulation(scene, device=arguments.device, dtype=arguments.dtype)
+    summary = simulation.summary
+    code = OK
+    try:
+        frames = warpfem.record(simulation, out)
+        for _ in _progress(frames, scene.frames + 1) if say else frames:
+            pass
+    except KeyboardInterrupt:
+        code = _fail(SimulationError(f"interrupted: {summary.frames} frames are in {out}"), FAILED)
+    except SimulationError as error:
+        error.add_note(f"{summary.frames} frames are in {out}")
+        code = _fail(error, FAILED)
+    except OutputError as error:
+        return _fail(error, FAILED if summary.steps else WRONG_USE)
+    if arguments.json:
+        print(json.dumps(_summary_data(summary, arguments, out), indent=2))
+    elif not arguments.quiet:
+        print(_summary_text(summary, simulation, out))
+    return code
+
+
+def _progress(frames: Iterable[Frame], total: int) -> Iterator[Frame]:
+    """A bar on a terminal where tqdm is installed, else a line now and then."""
+    if sys.stderr.isatty():
+        try:
+            from tqdm import tqdm
+        except ImportError:
+            pass
+        else:
+            yield from tqdm(frames, total=total, unit="frame")
+            return
+    last = time.monotonic()
+    for count, frame in enumerate(frames, 1):
+        if time.monotonic() - last > 5.0 or count == total:
+            last = time.monotonic()
+            print(f"frame {count} of {total}, t = {frame.time:.3f} s", file=sys.stderr)
+        yield frame
+
+
+def _summary_data(summary: Summary, arguments: argparse.Namespace, out: Path) -> dict:
+    data = {"scene": str(arguments.scene), "file": str(out), "dtype": arguments.dtype, **asdict(summary)}
+    return {name: None if value == float("inf") else value for name, value in data.items()}
+
+
+def _summary_text(summary: Summary, simulation: Simulation, out: Path) -> str:
+    lines = [
+        f"{summary.frames} frames, {summary.steps} steps of {summary.dt:.4g} s, "
+        f"{summary.simulated_seconds:.3f} s simulated",
+        f"wall time: {summary.setup_seconds:.2f} s to prepare, {summary.stepping_seconds:.2f} s to step",
+    ]
+    first, last = summary.first_energies, summary.last_energies
+    if first and last:
+        parts = [("kinetic", "kinetic"), ("elastic", "elastic")]
+        if simulation.model.dead_load is not None:
+            parts.append(("load", "load"))
+        if simulation.model.contact is not None:
+            parts.append(("contact", "contact"))
+        text = ", ".join(f"{label} {getattr(first, name):.4g} -> {getattr(last, name):.4g}" for label, name in parts)
+        lines.append(f"energy [J]: {text}, total {first.total:.4g} -> {last.total:.4g}")
+    lines.append(
+        f"largest von Mises stress {summary.largest_von_mises:.4g} Pa, smallest J {summary.smallest_jacobian:.4g}"
+    )
+    if simulation.model.contact is not None:
+        lines.append(f"deepest penetration {summary.largest_penetration:.3g} m")
+    if summary.newton_iterations:
+        lines.append(
+            f"{summary.newton_iterations} Newton and {summary.cg_iterations} conjugate gradient iterations "
+            f"({summary.newton_iterations / summary.steps:.1f} and {summary.cg_iterations / summary.steps:.0f} a step)"
+        )
+    if summary.unconverged_steps:
+        lines.append(
+            f"NOT CONVERGED in {summary.unconverged_steps} of {summary.steps} steps: worst residual "
+            f"{summary.worst_residual:.2e}, {summary.worst_note}"
+        )
+    lines.append(f"wrote {out}")
+    return "\n".join(lines)
+
+
+def _explain(arguments: argparse.Namespace) -> int:
+    """Says what a scene requires, and so what is modelled, compiled, stored and paid for in a step."""
+    from warpfem.explain import explain
+
+    _quiet_warp()
+    print(explain(Simulation(_load(arguments), device=arguments.device, dtype=arguments.dtype)))
+    return OK
+
+
+def _preview(arguments: argparse.Namespace) -> int:
+    """Draws a run: a sheet of frames as PNG, or the motion as GIF (needs the extra 'plot')."""
+    from warpfem.preview import preview
+
+    print(f"wrote {preview(arguments.file, arguments.out)}")
+    return OK
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    """Prints versions and devices."""
+    import warp
+
+    _quiet_warp()
+    warp.init()
+    print(f"warpfem {warpfem.__version__}, Python {platform.python_version()}, {platform.platform()}")
+    for package in ("warp-lang", "numpy", "usd-core"):
+        print(f"{package} {importlib.metadata.version(package)}")
+    for package, extra in EXTRAS.items():
+        try:
+            print(f"{package} {importlib.metadata.version(package)}")
+        except importlib.metadata.PackageNotFoundError:
+            print(f"{package} not installed: pip install 'warpfem[{extra}]'")
+    print("devices: " + ", ".join(f"{device.alias} ({device.name})" for device in warp.get_devices()))
+    return OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,74 @@
+"""Observes the kernel launches of a piece of code."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import warp as wp
+
+
+@dataclass
+class KernelUse:
+    """How one kernel was used.
+
+    Attributes:
+        name: the kernel's name.
+        module: its Warp module.
+        launches: times launched.
+        seconds: wall time of the launches [s].
+    """
+
+    name: str
+    module: str
+    launches: int = 0
+    seconds: float = 0.0
+
+
+@dataclass
+class Launches:
+    """Kernels launched while they were observed, in the order of their first launch."""
+
+    kernels: dict[tuple[str, str], KernelUse] = field(default_factory=dict)
+
+    def add(self, kernel: wp.Kernel, seconds: float) -> None:
+        """Counts a launch."""
+        key = (kernel.func.__name__, kernel.module.name)
+        use = self.kernels.setdefault(key, KernelUse(*key))
+        use.launches += 1
+        use.seconds += seconds
+
+    @property
+    def names(self) -> set[str]:
+        """Names of the kernels launched."""
+        return {name for name, _ in self.kernels}
+
+
+@contextmanager
+def observe_launches(device: str | None = None) -> Iterator[Launches]:
+    """Counts and times all kernel launches inside the block, each waited for on ``device``."""
+    seen = Launches()
+    launch, replay = wp.launch, wp.Launch.launch
+
+    def timed(kernel: wp.Kernel, call) -> object:
+        start = time.perf_counter()
+        result = call()
+        wp.synchronize_device(device)
+        seen.add(kernel, time.perf_counter() - start)
+        return result
+
+    def observed_launch(kernel, *args, record_cmd: bool = False, **kwargs):
+        if record_cmd:
+            return launch(kernel, *args, record_cmd=True, **kwargs)
+        return timed(kernel, lambda: launch(kernel, *args, **kwargs))
+
+    def observed_replay(self, *args, **kwargs):
+        return timed(self.kernel, lambda: replay(self, *args, **kwargs))
+
+    wp.launch, wp.Launch.launch = observed_launch, observed_replay
+    try:
+        yield seen
+    finally:
+        wp.launch, wp.Launch.launch = launch, replay

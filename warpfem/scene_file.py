@@ -1,0 +1,100 @@
+"""Scene files: Python files that define ``scene(**parameters) -> Scene``."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib.util
+import inspect
+import sys
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from warpfem.errors import SceneError, WarpfemError
+from warpfem.scene import Scene
+
+
+def load_scene(path: str | Path, settings: Mapping[str, str] | None = None) -> Scene:
+    """Runs a scene file and calls its ``scene`` function.
+
+    Args:
+        path: the file; its code is executed.
+        settings: values for parameters of ``scene``, as text; each is read as a Python literal where the
+            parameter's default is not a string.
+
+    Returns:
+        The scene.
+
+    Raises:
+        SceneError: no such file, no function ``scene``, an unknown parameter, a value of another type than
+            the default, or any error in the file, with its line.
+        WarpfemError: whatever the scene itself raises.
+    """
+    path = Path(path)
+    function = _scene_function(path)
+    arguments = _arguments(path, function, settings or {})
+    scene = _call(path, lambda: function(**arguments))
+    if not isinstance(scene, Scene):
+        raise SceneError(f"{path}: scene() must return a warpfem.Scene, not {type(scene).__name__}")
+    return scene
+
+
+def _scene_function(path: Path) -> Callable[..., Any]:
+    if not path.is_file():
+        raise SceneError(f"no scene file '{path}'")
+    if path.suffix != ".py":
+        raise SceneError(f"'{path}' is not a scene file: it must end in .py and define scene() -> Scene")
+    name = f"warpfem_scene_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None  # given for every existing .py file
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # Warp looks functions up there
+    loader = spec.loader
+    _call(path, lambda: loader.exec_module(module))
+    function = getattr(module, "scene", None)
+    if not callable(function):
+        raise SceneError(f"{path} does not define a function scene(**parameters) -> Scene")
+    return function
+
+
+def _call(path: Path, action: Callable[[], Any]) -> Any:
+    """Turns an error in the file into one that names its line."""
+    try:
+        return action()
+    except WarpfemError:
+        raise
+    except SyntaxError as error:
+        raise SceneError(f"{path}, line {error.lineno}: {error.msg}") from error
+    except Exception as error:
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        where = f"{path}, line {frames[-1].lineno}" if frames else str(path)
+        raise SceneError(f"{where}: {type(error).__name__}: {error}") from error
+
+
+def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:
+    parameters = inspect.signature(function).parameters
+    arguments = {}
+    for name, text in settings.items():
+        if name not in parameters:
+            close = difflib.get_close_matches(name, parameters, 1)
+            hint = f"; did you mean '{close[0]}'?" if close else ""
+            known = ", ".join(str(p) for p in parameters.values()) or "none"
+            raise SceneError(f"{path}: scene() has no parameter '{name}'{hint} It has: {known}")
+        arguments[name] = _value(path, name, text, parameters[name].default)
+    return arguments
+
+
+def _value(path: Path, name: str, text: str, default: Any) -> Any:
+    if isinstance(default, str):
+        return text
+    try:
+        value = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        value = text
+    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if default is not inspect.Parameter.empty and default is not None and type(value) is not type(default):
+        raise SceneError(f"{path}: {name} must be of type {type(default).__name__}, like {default!r}, not {text!r}")
+    return value

@@ -1,0 +1,207 @@
+"""Runs a scene frame by frame."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpfem.dtypes import FloatName
+from warpfem.errors import SimulationError
+from warpfem.model import Energies, Model
+from warpfem.scene import Scene
+from warpfem.solvers.base import Solver, require_finite
+
+AUTO_FRACTION = 0.5
+"""The part of the explicit stability limit at rest that ``dt="auto"`` takes: deformation stiffens cells."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What is recorded of one moment.
+
+    Attributes:
+        index: 0 for the initial state.
+        time: simulated time [s].
+        displacement: (point_count, dim) float64 [m].
+        velocity: (point_count, dim) float64 [m/s].
+        jacobian: J = det F of each cell.
+        von_mises: von Mises stress of each cell [Pa].
+        energies: the energies [J].
+        penetration: greatest depth inside an obstacle [m].
+    """
+
+    index: int
+    time: float
+    displacement: np.ndarray
+    velocity: np.ndarray
+    jacobian: np.ndarray
+    von_mises: np.ndarray
+    energies: Energies
+    penetration: float
+
+
+@dataclass
+class Summary:
+    """What a run did.
+
+    Attributes:
+        frames: frames recorded, the initial one included.
+        steps: time steps taken.
+        dt: time step [s].
+        simulated_seconds: simulated time [s].
+        setup_seconds: wall time to build the model, and to compile or load its kernels [s].
+        stepping_seconds: wall time of the steps [s].
+        first_energies, last_energies: energies of the first and the last frame [J].
+        largest_von_mises: over all frames [Pa].
+        smallest_jacobian: over all frames.
+        largest_penetration: over all frames [m].
+        newton_iterations, cg_iterations: totals over all steps.
+        unconverged_steps: implicit steps that stopped before their tolerance.
+        worst_residual: the largest relative residual among those.
+        worst_note: how that step ended.
+    """
+
+    dt: float
+    setup_seconds: float
+    frames: int = 0
+    steps: int = 0
+    simulated_seconds: float = 0.0
+    stepping_seconds: float = 0.0
+    first_energies: Energies | None = None
+    last_energies: Energies | None = None
+    largest_von_mises: float = 0.0
+    smallest_jacobian: float = math.inf
+    largest_penetration: float = 0.0
+    newton_iterations: int = 0
+    cg_iterations: int = 0
+    unconverged_steps: int = 0
+    worst_residual: float = 0.0
+    worst_note: str = ""
+
+    def add_frame(self, frame: Frame) -> None:
+        """Takes a frame into account."""
+        self.frames += 1
+        self.first_energies = self.first_energies or frame.energies
+        self.last_energies = frame.energies
+        self.largest_von_mises = max(self.largest_von_mises, float(frame.von_mises.max()))
+        self.smallest_jacobian = min(self.smallest_jacobian, float(frame.jacobian.min()))
+        self.largest_penetration = max(self.largest_penetration, frame.penetration)
+
+
+class Simulation:
+    """A scene on a device, ready to run.
+
+    Building it compiles or loads every kernel that a step needs, by one step that is thrown away, so that
+    mistakes show up before anything is written.
+
+    Attributes:
+        scene: the scene.
+        model: the scene on the device.
+        state: the current state.
+        dt: the time step [s].
+        steps_per_frame: time steps between two frames.
+        summary: what has been done so far.
+
+    Raises:
+        SceneError: the scene refers to something that does not exist or contradicts itself.
+        SimulationError: the first step cannot be taken.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        device: str | None = None,
+        dtype: FloatName = "float32",
+        solver: Solver | None = None,
+    ) -> None:
+        start = time.perf_counter()
+        self.scene = scene
+        self.model = Model(scene, device=device, dtype=dtype)
+        self.state = self.model.state()
+        self.stepper = (solver or scene.solver).stepper(self.model)
+        interval = 1.0 / scene.fps
+        self.steps_per_frame = max(1, math.ceil(interval / self._wanted_dt(interval) - 1e-9))
+        self.dt = interval / self.steps_per_frame
+        if scene.frames > 0:
+            self.stepper.step(self.state.copy(), self.dt)
+        self._observe(0)
+        self.summary = Summary(self.dt, time.perf_counter() - start)
+
+    def _wanted_dt(self, interval: float) -> float:
+        if self.scene.dt != "auto":
+            return self.scene.dt
+        limit = self.stepper.stable_dt()
+        return interval if limit is None else AUTO_FRACTION * limit
+
+    def frames(self) -> Iterator[Frame]:
+        """Runs the scene; yields the initial state and then one frame per frame interval.
+
+        Raises:
+            SimulationError: the run cannot go on. The frames yielded so far are good.
+        """
+        summary = self.summary
+        frame = self._observe(0)
+        summary.add_frame(frame)
+        yield frame
+        for index in range(1, self.scene.frames + 1):
+            start = time.perf_counter()
+            for _ in range(self.steps_per_frame):
+                self._step()
+            wp.synchronize_device(self.model.device)
+            summary.stepping_seconds += time.perf_counter() - start
+            frame = self._observe(index)
+            summary.add_frame(frame)
+            yield frame
+
+    def _step(self) -> None:
+        summary = self.summary
+        report = self.stepper.step(self.state, self.dt)
+        summary.steps += 1
+        summary.simulated_seconds = self.state.time
+        summary.newton_iterations += report.newton_iterations
+        summary.cg_iterations += report.cg_iterations
+        if not report.converged:
+            summary.unconverged_steps += 1
+            if report.residual >= summary.worst_residual:
+                summary.worst_residual, summary.worst_note = report.residual, report.note
+
+    def _observe(self, index: int) -> Frame:
+        model, state = self.model, self.state
+        require_finite(model, state.u, "the displacement", state.time)
+        require_finite(model, state.v, "the velocity", state.time)
+        displacement = state.displacement
+        jacobian, von_mises = model.diagnostics(state)
+        bad = ~np.isfinite(von_mises)
+        if bad.any():
+            first = int(np.argmax(bad))
+            body, cell = model.body_of_cell(first)
+            raise SimulationError(
+                f"t = {state.time:.6g} s: the stress of cell {cell} of body '{body.name}' is not finite "
+                f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). {type(body.material).__name__} "
+                "may not bear J <= 0: take a smaller dt, or StableNeoHookean"
+            )
+        return Frame(
+            index=index,
+            time=state.time,
+            displacement=displacement,
+            velocity=state.velocity,
+            jacobian=jacobian,
+            von_mises=von_mises,
+            energies=model.energies(state),
+            penetration=0.0 if model.contact is None else model.contact.depth(displacement),
+        )
+
+
+def body_slices(model: Model) -> list[tuple[slice, slice]]:
+    """The ranges of points and of cells of each body of a model."""
+    points, cells = model.point_starts, model.cell_starts
+    return [
+        (slice(int(points[i]), int(points[i + 1])), slice(int(cells[i]), int(cells[i + 1])))
+        for i in range(len(model.scene.bodies))
+    ]
