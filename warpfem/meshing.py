@@ -185,17 +185,17 @@ def _read_file(path: Path) -> Any:
     try:
         import meshio
     except ImportError as error:
-        raise MissingExtraError(f"reading {path.name}", error.name or "meshio", "mesh") from error
+        raise MissingExtraError(f"reading {path.name}", "meshio", "mesh") from error
     mark = _MARKS.get(path.suffix.lower())
-    if mark and not re.search(mark, path.read_bytes(), re.MULTILINE):
-        raise MeshError("the file is truncated, or not of the format that its name says")
     printed = io.StringIO()
     try:
+        if mark and not re.search(mark, path.read_bytes(), re.MULTILINE):
+            raise EOFError("a part is missing")
         with redirect_stdout(printed), redirect_stderr(printed):
             file = meshio.read(path)
     except (Exception, SystemExit) as error:  # meshio raises anything on damaged files, and may exit
         reason = " ".join(printed.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise MeshError(f"the file is damaged or of an unknown format ({reason})") from error
+        raise MeshError(f"the file is damaged, cut short or of an unknown format ({reason})") from error
     if remarks := " ".join(printed.getvalue().split()):
         warnings.warn(f"{path}: meshio says: {remarks}", stacklevel=3)
     return file
