@@ -1,6 +1,5 @@
 """Meshes from files and from closed surfaces."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -408,8 +407,3 @@ def test_a_package_that_lacks_one_of_its_own_names_that(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "pytetwild", raising=False)
     with pytest.raises(MissingExtraError, match=r"'lacking': pip install 'warpfem\[tet\]'"):
         tetrahedralize(*CUBE)
-
-
-def test_importing_costs_no_optional_package():
-    code = "import sys, warpfem.meshing; print(sorted({'meshio', 'pytetwild'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
