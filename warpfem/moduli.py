@@ -57,7 +57,7 @@ def elastic_moduli(
             (mu > 0 and K > 0, which is nu in (-1, 0.5) and E > 0).
     """
     given = {
-        name: np.asarray(value, dtype=np.float64)
+        name: _values(name, value)
         for name, value in dict(E=E, nu=nu, K=K, lam=lam, mu=mu, K_plane_strain=K_plane_strain).items()
         if value is not None
     }
@@ -76,6 +76,8 @@ def elastic_moduli(
             raise MaterialError(f"{name} must be {domain}: {_offender(value, bad)}")
     first, second = given
     a, b = given[first], given[second]
+    if a.ndim == b.ndim == 1 and len(a) != len(b):
+        raise MaterialError(f"{first} is given for {len(a)} cells but {second} for {len(b)}")
     with np.errstate(all="ignore"):
         shear, first_lame = _lame_parameters(first, a, second, b)
         bulk = first_lame + 2.0 / 3.0 * shear
@@ -101,22 +103,22 @@ def _lame_parameters(first: str, a: np.ndarray, second: str, b: np.ndarray) -> t
             mu = 3.0 * b * a / (9.0 * b - a)
             return mu, b - 2.0 / 3.0 * mu
         case "E", "lam":
-            return (a - 3.0 * b + np.sqrt(a * a + 9.0 * b * b + 2.0 * a * b)) / 4.0, b
+            root = np.sqrt(a * a + 9.0 * b * b + 2.0 * a * b)
+            excess = 3.0 * b - a  # the two forms are equal: each is free of cancellation on one side
+            return np.where(excess > 0.0, 2.0 * a * b / (excess + root), (root - excess) / 4.0), b
         case "E", "mu":
             return b, b * (a - 2.0 * b) / (3.0 * b - a)
         case "E", "K_plane_strain":
             mu = 2.0 * a / (3.0 + np.sqrt(9.0 - 4.0 * a / b))
             return mu, b - mu
         case "nu", "K":
-            mu = 1.5 * b * (1.0 - 2.0 * a) / (1.0 + a)
-            return mu, b - 2.0 / 3.0 * mu
+            return 1.5 * b * (1.0 - 2.0 * a) / (1.0 + a), 3.0 * b * a / (1.0 + a)
         case "nu", "lam":
             return b * (1.0 - 2.0 * a) / (2.0 * a), b
         case "nu", "mu":
             return b, 2.0 * b * a / (1.0 - 2.0 * a)
         case "nu", "K_plane_strain":
-            mu = b * (1.0 - 2.0 * a)
-            return mu, b - mu
+            return b * (1.0 - 2.0 * a), 2.0 * b * a
         case "K", "lam":
             return 1.5 * (a - b), b
         case "K", "mu":
@@ -130,6 +132,16 @@ def _lame_parameters(first: str, a: np.ndarray, second: str, b: np.ndarray) -> t
             return b - a, a
         case _:  # mu, K_plane_strain
             return a, b - a
+
+
+def _values(name: str, value: Parameter) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise MaterialError(f"{name} must be a number or one number per cell, not {value!r}") from None
+    if array.ndim > 1:
+        raise MaterialError(f"{name} must be a number or one number per cell, not an array of shape {array.shape}")
+    return array
 
 
 def _offender(value: np.ndarray, bad: np.ndarray) -> str:
