@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import warp as wp
 
 from warpfem.errors import MaterialError
@@ -53,6 +54,29 @@ def _probe(H: Any, dH: Any):
     if size > wp.float64(0.0):
         step = step / size
     return F, step * direction, one / (wp.float64(2.0) * step)
+
+
+@functools.cache
+def _check(psi: Any, parameter_count: int) -> None:
+    """Raises MaterialError unless Warp can compile psi as it is called here (0.1 s the first time)."""
+    vector64 = wp.types.vector(length=parameter_count, dtype=wp.float64)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def probe(
+        F: wp.array(dtype=wp.mat33d),
+        parameters: wp.array(dtype=vector64),
+        psi_out: wp.array(dtype=wp.float64),
+    ):
+        psi_out[0] = psi(F[0], parameters[0])
+
+    try:
+        wp.load_module(probe.module, device="cpu")
+    except Exception as error:  # Warp raises many types for what it cannot translate
+        detail = str(error).partition("\n;")[2] or str(error)  # without the lines about the probe
+        raise MaterialError(
+            f"EnergyMaterial: psi '{psi.key}' must be psi(F: wp.mat33d, parameters: Any) -> wp.float64, with all "
+            f"numbers in float64, as wp.float64(0.5), and {parameter_count} parameters. Warp says: {detail}"
+        ) from error
 
 
 @functools.cache
@@ -122,7 +146,8 @@ class EnergyMaterial(Material):
             using the principal axes, which a fibre-reinforced material does not share.
 
     Raises:
-        MaterialError: if psi is not a ``@wp.func`` of two arguments, or there is no parameter.
+        MaterialError: if psi is not a ``@wp.func`` of two arguments, Warp cannot translate it in float64, or
+            there is no parameter or one that is not finite.
     """
 
     psi: Any
@@ -140,6 +165,14 @@ class EnergyMaterial(Material):
             raise MaterialError(f"EnergyMaterial: psi '{self.psi.key}' must take two arguments, F and parameters")
         if not self.values:
             raise MaterialError("EnergyMaterial: give at least one parameter, as values={'mu': 1e5}")
+        for name, value in self.values.items():
+            try:
+                finite = bool(np.isfinite(np.asarray(value, dtype=np.float64)).all())
+            except (TypeError, ValueError):
+                finite = False
+            if not finite:
+                raise MaterialError(f"EnergyMaterial: parameter '{name}' must be finite numbers, not {value!r}")
+        _check(self.psi, len(self.values))
 
     @property
     def constitutive(self) -> Constitutive:
