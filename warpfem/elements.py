@@ -17,18 +17,24 @@ from warpfem.tensor import (
     deformation_gradient,
     embed,
     identity_like,
+    mat22,
+    mat33,
     signed_svd,
     volume_change,
 )
 
 
 @wp.func
-def _positive_part(A: Any):
-    """The symmetric matrix A with its negative eigenvalues set to zero."""
-    shift = wp.sqrt(wp.ddot(A, A))
-    V, _s, _V = signed_svd(A + shift * identity_like(A))  # positive semi-definite: V holds eigenvectors
-    D = wp.transpose(V) * A * V
-    return V * wp.cw_mul(identity_like(A), _clamped(D)) * wp.transpose(V)
+def _is_positive(A: mat22):
+    """Whether a symmetric matrix is positive definite (Sylvester's criterion)."""
+    return A[0, 0] > A.dtype(0.0) and wp.determinant(A) > A.dtype(0.0)
+
+
+@wp.func
+def _is_positive(A: mat33):
+    zero = A.dtype(0.0)
+    minor = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    return A[0, 0] > zero and minor > zero and wp.determinant(A) > zero
 
 
 @wp.func
@@ -36,6 +42,17 @@ def _clamped(A: Any):
     for i in range(len(A)):
         A[i, i] = wp.max(A[i, i], A.dtype(0.0))
     return A
+
+
+@wp.func
+def _positive_part(A: Any):
+    """The symmetric matrix A with its negative eigenvalues set to zero."""
+    if _is_positive(A):
+        return A
+    shift = wp.sqrt(wp.ddot(A, A))
+    V, _s, _V = signed_svd(A + shift * identity_like(A))  # positive semi-definite: V holds eigenvectors
+    D = wp.transpose(V) * A * V
+    return V * wp.cw_mul(identity_like(A), _clamped(D)) * wp.transpose(V)
 
 
 class ElementKernels:
@@ -171,19 +188,19 @@ class ElementKernels:
     @functools.cached_property
     def stiffness(self) -> wp.Kernel:
         """Adds the d x d blocks K_ab of each cell's tangent stiffness to ``blocks_out[slots[i, a, b]]``."""
-        return self._stiffness_kernel(self._exact_rule())
+        return self._exact_stiffness_kernel()
 
     @functools.cached_property
     def clamped_stiffness(self) -> wp.Kernel:
         """:attr:`stiffness` with each element's K made positive semi-definite (isotropic materials)."""
-        return self._stiffness_kernel(self._clamped_rule()) if self._clampable else self.stiffness
+        return self._clamped_stiffness_kernel() if self._clampable else self.stiffness
 
-    def _stiffness_kernel(self, rule: tuple) -> wp.Kernel:
+    def _exact_stiffness_kernel(self) -> wp.Kernel:
         dim = self.dim
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         displacement_gradient = self._displacement_gradient
-        tangent, apply = rule
+        stress_differential = self.constitutive.stress_differential
 
         @wp.kernel(module="unique", enable_backward=False)
         def element_stiffness(
@@ -196,21 +213,18 @@ class ElementKernels:
             blocks_out: wp.array(dtype=matrix),
         ):
             i = wp.tid()
-            cell = cells[i]
             B = inverse_shape[i]
             p = parameters[i]
-            V = volume[i]
-            material_tangent = tangent(displacement_gradient(u, cell, B), p)
+            H = displacement_gradient(u, cells[i], B)
             count = int(dim)
             for b in range(count):  # the columns of shape function b + 1, of component c
                 column_sum = matrix()
                 for c in range(count):
                     axis = vector()
                     axis[c] = scalar(1.0)
-                    dP = V * apply(material_tangent, wp.outer(axis, B[b]), p)
+                    dP = volume[i] * stress_differential(H, wp.outer(axis, B[b]), p)
                     for a in range(count):
-                        column = dP * B[a]
-                        block = wp.outer(column, axis)
+                        block = wp.outer(dP * B[a], axis)
                         column_sum += block
                         wp.atomic_add(blocks_out, slots[i, a + 1, b + 1], block)
                         wp.atomic_add(blocks_out, slots[i, a + 1, 0], -block)
@@ -218,6 +232,47 @@ class ElementKernels:
                 wp.atomic_add(blocks_out, slots[i, 0, 0], column_sum)
 
         return element_stiffness
+
+    def _clamped_stiffness_kernel(self) -> wp.Kernel:
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        tangent, _apply = self._clamped_rule()
+        gradients_type = wp.types.matrix(shape=(dim + 1, dim), dtype=scalar)
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def clamped_element_stiffness(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            volume: wp.array(dtype=scalar),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            slots: wp.array3d(dtype=wp.int32),
+            blocks_out: wp.array(dtype=matrix),
+        ):
+            i = wp.tid()
+            B = inverse_shape[i]
+            t = tangent(displacement_gradient(u, cells[i], B), parameters[i])
+            gradients = gradients_type()  # of the shape functions, in the principal axes of C
+            for k in range(dim):
+                g = B[k] * t.V
+                gradients[k + 1] = g
+                gradients[0] = gradients[0] - g
+            corners = int(dim + 1)
+            for a in range(corners):
+                g = gradients[a]
+                for b in range(a, corners):
+                    h = gradients[b]
+                    # K_ab in the principal axes: entry (m, n) is the sum over j, l of dP_mj/dF_nl g_j h_l
+                    K = wp.cw_mul(t.stretch, wp.outer(g, h)) + wp.cw_mul(t.swapped, wp.outer(h, g))
+                    K += wp.diag(t.same * wp.cw_mul(g, h))
+                    block = volume[i] * (t.U * K * wp.transpose(t.U))
+                    wp.atomic_add(blocks_out, slots[i, a, b], block)
+                    if b > a:
+                        wp.atomic_add(blocks_out, slots[i, b, a], wp.transpose(block))
+
+        return clamped_element_stiffness
 
     @functools.cached_property
     def stress(self) -> wp.Kernel:

@@ -180,6 +180,23 @@ def in_plane(A: mat33, like: mat33):  # noqa: F811
 
 
 @wp.func
+def _squared_epsilon(like: wp.float32):
+    return wp.float32(1.0e-15)
+
+
+@wp.func
+def _squared_epsilon(like: wp.float64):
+    return wp.float64(1.0e-33)
+
+
+@wp.func
+def _orthogonal(a: Any, b: Any):
+    """Whether a and b are orthogonal to rounding."""
+    gamma = wp.dot(a, b)
+    return gamma * gamma <= _squared_epsilon(gamma) * wp.dot(a, a) * wp.dot(b, b)
+
+
+@wp.func
 def _orthogonalize(a: Any, b: Any, v: Any, w: Any):
     """Rotates the columns (a, b) of a matrix to be orthogonal, and (v, w) with them (one Jacobi rotation)."""
     alpha = wp.dot(a, a)
@@ -188,7 +205,7 @@ def _orthogonalize(a: Any, b: Any, v: Any, w: Any):
     one = type(gamma)(1.0)
     c = one
     s = type(gamma)(0.0)
-    if gamma * gamma > type(gamma)(1.0e-34) * alpha * beta:
+    if not _orthogonal(a, b):
         zeta = (beta - alpha) / (type(gamma)(2.0) * gamma)
         if wp.abs(zeta) < type(gamma)(1.0e18):
             t = one / (wp.abs(zeta) + wp.sqrt(one + zeta * zeta))
@@ -260,8 +277,10 @@ def signed_svd(F: mat33):  # noqa: F811
     u = wp.vector(one, zero, zero)
     v = wp.vector(zero, one, zero)
     w = wp.vector(zero, zero, one)
-    sweeps = 6
+    sweeps = int(6)
     for _sweep in range(sweeps):
+        if _orthogonal(a, b) and _orthogonal(b, c) and _orthogonal(a, c):
+            break
         a, b, u, v = _orthogonalize(a, b, u, v)
         b, c, v, w = _orthogonalize(b, c, v, w)
         a, c, u, w = _orthogonalize(a, c, u, w)
@@ -316,13 +335,15 @@ def polar_rotation(F: mat33):  # noqa: F811
     J = wp.determinant(A)
     c0 = one - F.dtype(4.0) * wp.ddot(C, C)
     i1 = F.dtype(1.7320508075688772)
-    iterations = 12
+    iterations = int(12)
     for _iteration in range(iterations):
         square = i1 * i1
         value = (square - F.dtype(2.0)) * square - F.dtype(8.0) * J * i1 + c0
         slope = F.dtype(4.0) * i1 * (square - one) - F.dtype(8.0) * J
-        if slope > F.dtype(0.0):
-            i1 = i1 - value / slope
+        step = value / wp.max(slope, F.dtype(1.0e-6))
+        i1 = i1 - step
+        if wp.abs(step) < F.dtype(1.0e-5):
+            break  # the next error is of the order of the square, and the polish squares it twice more
     i2 = F.dtype(0.5) * (i1 * i1 - one)
     denominator = i1 * i2 - J
     if not (denominator > F.dtype(2.0e-3)):
