@@ -103,7 +103,7 @@ def explain(simulation: Simulation) -> Explanation:
 
 def _terms(simulation: Simulation) -> list[Term]:
     scene, model = simulation.scene, simulation.model
-    cells = Counter()
+    cells: Counter[str] = Counter()
     for body in scene.bodies:
         cells[body.material.name] += body.mesh.cell_count
     loads = [load for body in scene.bodies for load in body.loads]
@@ -144,7 +144,7 @@ def _terms(simulation: Simulation) -> list[Term]:
     ]
 
 
-def _size(count: int) -> str:
+def _size(count: float) -> str:
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.3g} {unit}"

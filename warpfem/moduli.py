@@ -85,8 +85,8 @@ def elastic_moduli(
     if bad.any():
         pair = np.broadcast_arrays(a, b)
         where = "" if bad.ndim == 0 else f" in cell {int(np.argmax(bad))} ({int(bad.sum())} in all)"
-        values = ", ".join(f"{name}={value.flat[np.argmax(bad)]:g}" for name, value in zip(given, pair, strict=True))
-        raise MaterialError(f"no stable solid has {values}{where}: mu > 0, K > 0 and nu in (-1, 0.5) must hold")
+        shown = ", ".join(f"{name}={value.flat[np.argmax(bad)]:g}" for name, value in zip(given, pair, strict=True))
+        raise MaterialError(f"no stable solid has {shown}{where}: mu > 0, K > 0 and nu in (-1, 0.5) must hold")
     young = 9.0 * bulk * shear / (3.0 * bulk + shear)
     poisson = first_lame / (2.0 * (first_lame + shear))
     values = dict(E=young, nu=poisson, K=bulk, lam=first_lame, mu=shear, K_plane_strain=first_lame + shear)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from unittest.mock import patch
 
 import warp as wp
 
@@ -47,7 +48,7 @@ class Launches:
 
 
 @contextmanager
-def observe_launches(device: str | None = None) -> Iterator[Launches]:
+def observe_launches(device: wp.DeviceLike = None) -> Iterator[Launches]:
     """Counts and times all kernel launches inside the block, each waited for on ``device``."""
     seen = Launches()
     launch, replay = wp.launch, wp.Launch.launch
@@ -59,16 +60,13 @@ def observe_launches(device: str | None = None) -> Iterator[Launches]:
         seen.add(kernel, time.perf_counter() - start)
         return result
 
-    def observed_launch(kernel, *args, record_cmd: bool = False, **kwargs):
-        if record_cmd:
-            return launch(kernel, *args, record_cmd=True, **kwargs)
+    def observed_launch(kernel, *args, **kwargs):
+        if kwargs.get("record_cmd"):
+            return launch(kernel, *args, **kwargs)
         return timed(kernel, lambda: launch(kernel, *args, **kwargs))
 
     def observed_replay(self, *args, **kwargs):
         return timed(self.kernel, lambda: replay(self, *args, **kwargs))
 
-    wp.launch, wp.Launch.launch = observed_launch, observed_replay
-    try:
+    with patch.object(wp, "launch", observed_launch), patch.object(wp.Launch, "launch", observed_replay):
         yield seen
-    finally:
-        wp.launch, wp.Launch.launch = launch, replay

@@ -1,0 +1,42 @@
+# make demo   install, run a real scene, and say where its USD file and picture are
+# make test   install and run the tests on the CPU
+# make slow   the long checks too
+# make lint   style and types
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test slow lint clean
+
+$(VENV)/installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	touch $@
+
+# What the demo and some tests like to have but can do without: a failure is no obstacle.
+$(VENV)/extras: $(VENV)/installed
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[tet,plot,mesh,progress]'
+	touch $@
+
+demo: $(VENV)/extras
+	$(BIN)/warpfem run scenes/bear.py --out output/bear.usdc
+	-$(BIN)/warpfem preview output/bear.usdc --out output/bear.png
+	@echo
+	@echo "The animation: $(CURDIR)/output/bear.usdc (open it in Blender with File > Import > Universal Scene Description)"
+	@if [ -f output/bear.png ]; then echo "A picture:     $(CURDIR)/output/bear.png"; fi
+
+test: $(VENV)/extras
+	$(BIN)/python -m pytest
+
+slow: $(VENV)/extras
+	$(BIN)/python -m pytest -m 'slow or not slow'
+
+lint: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy warpfem
+
+clean:
+	rm -rf $(VENV) output
