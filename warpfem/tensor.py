@@ -134,7 +134,8 @@ def log1p_deficit(y: Any):
     z = y / (type(y)(2.0) + y)
     w = z * z
     one = type(y)(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
-    series = one / type(y)(17.0)
+    series = one / type(y)(19.0)
+    series = series * w + one / type(y)(17.0)
     series = series * w + one / type(y)(15.0)
     series = series * w + one / type(y)(13.0)
     series = series * w + one / type(y)(11.0)
@@ -148,6 +149,8 @@ def log1p_deficit(y: Any):
 @wp.func
 def log1p(y: Any):
     """ln(1 + y), accurate for small y; NaN for y < -1."""
+    if wp.abs(y) > type(y)(0.3):
+        return wp.log(type(y)(1.0) + y)
     return y - log1p_deficit(y)
 
 
