@@ -67,13 +67,18 @@ def support_kernels(dim: int, dtype: str) -> SimpleNamespace:
 @dataclass
 class _Moving:
     body: str
-    rows: np.ndarray  # of this motion's points among the held points
+    points: np.ndarray  # numbers in the body's mesh
+    rows: np.ndarray  # their places among the held points
     held: np.ndarray  # (k, dim) bool
     rest: np.ndarray  # (k, dim)
     motion: Callable[[np.ndarray, float], np.ndarray]
 
     def displacement(self, time: float) -> np.ndarray:
-        x = np.asarray(self.motion(self.rest.copy(), time), dtype=np.float64)
+        x = np.asarray(self.motion(self.rest.copy(), time))
+        if x.dtype.kind not in "fiu":
+            raise SceneError(
+                f"body '{self.body}': the prescribed motion returned {x.dtype} at t = {time:g} s; expected numbers"
+            )
         if x.shape != self.rest.shape:
             raise SceneError(
                 f"body '{self.body}': the prescribed motion returned shape {x.shape} at t = {time:g} s; "
@@ -83,7 +88,7 @@ class _Moving:
         if bad.any():
             raise SceneError(
                 f"body '{self.body}': the prescribed motion is not finite at t = {time:g} s "
-                f"for its point {int(np.argmax(bad))} ({int(bad.sum())} in all)"
+                f"for point {int(self.points[np.argmax(bad)])} ({int(bad.sum())} in all)"
             )
         return x - self.rest
 
@@ -135,19 +140,19 @@ class Supports:
             mask = np.zeros((len(selected), dim), dtype=bool)
             mask[:, list(axes)] = True
             rows = np.searchsorted(self.host_points, start + selected)
-            self._moving.append(_Moving(body.name, rows, mask, body.mesh.points[selected], motion))
+            self._moving.append(_Moving(body.name, selected, rows, mask, body.mesh.points[selected], motion))
         self.target = wp.zeros(self.count, dtype=self.types.vector, device=device)
         self.target_rate = wp.zeros(self.count, dtype=self.types.vector, device=device)
 
     @staticmethod
     def _axes(body: Body, support: Pin | PrescribedMotion) -> tuple[int, ...]:
         dim = body.mesh.dim
-        axes = tuple(range(dim)) if support.axes is None else tuple(support.axes)
-        if not axes or any(axis not in range(dim) for axis in axes):
+        axes = range(dim) if support.axes is None else np.atleast_1d(support.axes).tolist()
+        if not axes or any(isinstance(axis, bool | float) or axis not in range(dim) for axis in axes):
             raise SceneError(
                 f"body '{body.name}', {type(support).__name__}: axes {support.axes!r} must be among 0..{dim - 1}"
             )
-        return axes
+        return tuple(axes)
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
