@@ -2,10 +2,11 @@
 
 A point at depth g below an obstacle's surface has the energy k A g^2 / 2, where A is the point's share of
 the rest surface and k the stiffness [Pa/m]; a pressure p therefore rests at the depth p / k. In implicit
-steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact, section 5) with
-normal force and normal of the step's start: below ``slip_speed`` it falls off quadratically, so that a point
-that ought to stick creeps, slower than ``slip_speed``. In explicit steps it is an impulse that stops the
-tangential motion, up to mu times the normal impulse.
+steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact, section 5): below
+``slip_speed`` it falls off quadratically, so that a point that ought to stick creeps, slower than
+``slip_speed``. Its limit and normal are those of the last Newton iterate, so that the converged step obeys
+mu times the normal force of the same step. A step of one linear solve makes it a drag. In explicit steps it
+is an impulse that stops the tangential motion, up to mu times the normal impulse.
 """
 
 import functools
@@ -25,7 +26,8 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
     """The kernels for one kind of obstacle, :class:`Plane` or :class:`Sphere`.
 
     They take the obstacle as ``axis`` (the plane's normal; unused by a sphere) and ``radius`` (unused by a
-    plane), and each surface point's place relative to the plane's point or the sphere's centre.
+    plane), and as ``origin`` each surface point's rest place relative to its foot on the plane or to the
+    sphere's centre.
     """
     t = types(dim, dtype)
     vector, matrix, scalar = t.vector, t.matrix, t.scalar
@@ -192,6 +194,22 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             blocks_out[i] += magnitude[k] * block
 
     @wp.kernel(module=module, enable_backward=False)
+    def friction_drag(
+        points: wp.array(dtype=wp.int32),
+        normal: wp.array(dtype=vector),
+        u_start: wp.array(dtype=vector),
+        slip_limit: scalar,
+        u_expected: wp.array(dtype=vector),
+        magnitude_out: wp.array(dtype=scalar),
+    ):
+        """Lowers the limit so that the law's slope at rest, 2/l, gives the limit itself at the expected slip."""
+        k = wp.tid()
+        i = points[k]
+        slip = scalar(2.0) * wp.length(slip_of(u_expected[i], u_start[i], normal[k]))
+        if slip > slip_limit:
+            magnitude_out[k] *= slip_limit / slip
+
+    @wp.kernel(module=module, enable_backward=False)
     def friction_impulse(
         points: wp.array(dtype=wp.int32),
         magnitude: wp.array(dtype=scalar),
@@ -219,6 +237,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         friction_energy=friction_energy,
         friction_force=friction_force,
         friction_blocks=friction_blocks,
+        friction_drag=friction_drag,
         friction_impulse=friction_impulse,
     )
 
@@ -235,12 +254,15 @@ class _ObstacleContact:
         self.count = len(surface.rest)
         self.points = surface.points
         if isinstance(obstacle, Plane):
-            place, axis, radius = obstacle.point, obstacle.normal, 0.0
+            axis, radius = obstacle.normal, 0.0
+            n = np.array(axis)
+            origin = np.outer((surface.rest - np.array(obstacle.point)) @ n, n)  # the rest would cost digits
         else:
-            place, axis, radius = obstacle.center, (0.0,) * dim, obstacle.radius
+            axis, radius = (0.0,) * dim, obstacle.radius
+            origin = surface.rest - np.array(obstacle.center)
         pressure_rate = surface.stiffness if obstacle.stiffness is None else obstacle.stiffness
         self.shape = [t.vector(*axis), t.scalar(radius)]
-        self.origin = wp.array(surface.rest - np.array(place), dtype=t.vector, device=self.device)
+        self.origin = wp.array(origin, dtype=t.vector, device=self.device)
         self.host_stiffness = pressure_rate * surface.areas  # N/m
         self.stiffness = wp.array(self.host_stiffness, dtype=t.scalar, device=self.device)
         self.normal_arguments = [self.points, self.origin, self.stiffness, *self.shape]
@@ -287,11 +309,15 @@ class Contact:
     def __init__(self, obstacles: Sequence[Obstacle], surface: ContactSurface, slip_speed: float, dtype: str) -> None:
         self.surface = surface
         self.slip_speed = slip_speed
-        single: list[Plane | Sphere] = []
+        self._obstacles: list[Plane | Sphere] = []
+        self.parts: list[_ObstacleContact] = []
+        self._host_stiffness = np.zeros(len(surface.rest))
         for obstacle in obstacles:
-            single += obstacle.planes() if isinstance(obstacle, BoxWalls) else [obstacle]
-        self._obstacles = single
-        self.parts = [_ObstacleContact(obstacle, surface, dtype) for obstacle in single]
+            single = obstacle.planes() if isinstance(obstacle, BoxWalls) else [obstacle]
+            self._obstacles += single
+            self.parts += [_ObstacleContact(one, surface, dtype) for one in single]
+            # once for the walls of a box: those that a point can touch together are perpendicular
+            self._host_stiffness += self.parts[-1].host_stiffness
         self._rough = [part for part in self.parts if part.friction > 0.0]
 
     @property
@@ -305,8 +331,7 @@ class Contact:
 
     def largest_stiffness_over_mass(self, mass: np.ndarray) -> float:
         """An upper bound of the squared angular frequency [1/s^2] that contact adds."""
-        stiffness = sum(part.host_stiffness for part in self.parts)
-        return float((stiffness / mass[self.surface.host_points]).max())
+        return float((self._host_stiffness / mass[self.surface.host_points]).max())
 
     def depth(self, u: np.ndarray) -> float:
         """The greatest depth of penetration [m] at the displacements ``u`` (n, dim); 0 without contact."""
@@ -335,16 +360,21 @@ class Contact:
         for part in self.parts:
             part.launch("stiffness_blocks", [*part.normal_arguments, u], [blocks_out])
 
-    # Friction of one step: begin_friction at its start, then the potential's terms at any trial u.
+    # Friction of one step: its limits are those at one u, then come the potential's terms at any trial u.
 
-    def begin_friction(self, u_start: wp.array) -> None:
-        """Takes normal forces and normals at ``u_start`` for the friction of the step that begins there."""
+    def limit_friction(self, u: wp.array) -> None:
+        """Takes the friction limits, mu times the normal forces, and the normals at ``u``."""
         for part in self._rough:
-            part.launch(
-                "friction_limit",
-                [*part.normal_arguments, part.friction, u_start],
-                [part.magnitude, part.normal],
-            )
+            part.launch("friction_limit", [*part.normal_arguments, part.friction, u], [part.magnitude, part.normal])
+
+    def linearize_friction(self, u_start: wp.array, dt: float, u_expected: wp.array) -> None:
+        """Makes friction a drag that reaches its limit at the slip from ``u_start`` to ``u_expected``.
+
+        For a step of one linear solve about ``u_start``, where the law's own slope would hold every point.
+        """
+        for part in self._rough:
+            inputs = [part.points, part.normal, u_start, self.slip_speed * dt, u_expected]
+            part.launch("friction_drag", inputs, [part.magnitude])
 
     def _friction_arguments(self, part: _ObstacleContact, u_start: wp.array, dt: float, u: wp.array) -> list:
         return [part.points, part.magnitude, part.normal, u_start, self.slip_speed * dt, u]
@@ -366,6 +396,6 @@ class Contact:
 
     def apply_friction_impulse(self, u: wp.array, inverse_mass: wp.array, dt: float, v: wp.array) -> None:
         """Explicit friction over ``dt`` with the normal forces at ``u``."""
-        self.begin_friction(u)
+        self.limit_friction(u)
         for part in self._rough:
             part.launch("friction_impulse", [part.points, part.magnitude, part.normal, inverse_mass, dt], [v])

@@ -67,8 +67,22 @@ class Solver(ABC):
         """A stepper for ``model``."""
 
 
+def require_positive(dt: float) -> None:
+    """Raises SimulationError unless the time step is a finite number > 0."""
+    if not 0.0 < dt < np.inf:
+        raise SimulationError(f"dt must be a finite number > 0, not {dt!r}")
+
+
+def worst_cell(model: Model, u: wp.array) -> str:
+    """Names the cell with the least J at the displacements ``u``."""
+    jacobian, _ = model.diagnostics(State(u, u))
+    cell = int(np.argmin(jacobian))
+    body, own = model.body_of_cell(cell)
+    return f"cell {own} of body '{body.name}' has J = {jacobian[cell]:.4g}"
+
+
 def require_finite(model: Model, vector: wp.array, what: str, time: float) -> None:
-    """Raises SimulationError that names the first point where ``vector`` is not finite, and its cell's J."""
+    """Raises SimulationError that names the first point where ``vector`` is not finite."""
     bad = ~np.isfinite(vector.numpy()).all(axis=1)
     if not bad.any():
         return

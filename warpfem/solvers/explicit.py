@@ -9,7 +9,7 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.errors import SimulationError
 from warpfem.model import Model, State
-from warpfem.solvers.base import Solver, Stepper, StepReport
+from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, worst_cell
 
 
 @functools.cache
@@ -53,10 +53,11 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
         mass = density[block.index] * volume / corners
         A = stiffness.reshape(block.count, corners * model.dim, -1) / mass[:, None, None]
         scale = np.linalg.norm(A, axis=(1, 2))
-        A = A / scale[:, None, None]
+        A = A / np.where(scale > 0.0, scale, 1.0)[:, None, None]
         A = A @ A
         A = A @ A
-        largest = max(largest, float((scale * np.sqrt(np.linalg.norm(A, axis=(1, 2)) ** 0.5)).max()))
+        bound = scale * np.linalg.norm(A, axis=(1, 2)) ** 0.25
+        largest = np.maximum(largest, bound.max())  # not a number stays
     if model.contact is not None:
         largest += model.contact.largest_stiffness_over_mass(model.host_mass)
     return float(np.sqrt(largest))
@@ -77,8 +78,15 @@ class _ExplicitStepper(Stepper):
         return 2.0 / largest_frequency(self.model)
 
     def _check_dt(self, state: State, dt: float) -> None:
+        require_positive(dt)
         if self._limit is None:  # at rest and in the first state, whichever is stiffer
-            self._limit = min(self.stable_dt(), 2.0 / largest_frequency(self.model, state.u))
+            limit = 2.0 / largest_frequency(self.model, state.u)
+            if not np.isfinite(limit):
+                raise SimulationError(
+                    f"t = {state.time:.6g} s: the stiffness of the state is not finite; "
+                    f"{worst_cell(self.model, state.u)}. Start from a state with J > 0, or take StableNeoHookean"
+                )
+            self._limit = min(self.stable_dt(), limit)
         if dt > self._limit:
             raise SimulationError(
                 f"dt = {dt:.4g} s is above the stability limit of explicit steps in this scene, "
@@ -131,11 +139,11 @@ class _SymplecticEulerStepper(_ExplicitStepper):
 class _VelocityVerletStepper(_ExplicitStepper):
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        self._known: tuple[int, int] | None = None  # state and revision that the force belongs to
+        self._known: tuple[State, int] | None = None  # state and revision that the force belongs to
 
     def step(self, state: State, dt: float) -> StepReport:
         self._begin(state, dt)
-        if self._known != (id(state), state.revision):
+        if self._known is None or self._known[0] is not state or self._known[1] != state.revision:
             self.model.force(state.u, self._force)
         decay = float(np.exp(-0.5 * self.model.scene.damping * dt))
         half = 0.5 * dt
@@ -152,7 +160,7 @@ class _VelocityVerletStepper(_ExplicitStepper):
         self._hold(state)
         state.time += dt
         state.revision += 1
-        self._known = (id(state), state.revision)
+        self._known = (state, state.revision)
         return StepReport()
 
 

@@ -13,7 +13,7 @@ from warpfem.errors import SceneError, SimulationError
 from warpfem.linear import ConjugateGradients, LinearStatus, tangent_operator
 from warpfem.model import Model, Route, State
 from warpfem.points import CHUNK, chunks
-from warpfem.solvers.base import Solver, Stepper, StepReport, require_finite
+from warpfem.solvers.base import Solver, Stepper, StepReport, require_finite, require_positive, worst_cell
 
 
 @functools.cache
@@ -84,10 +84,15 @@ def _implicit_kernels(dim: int, dtype: str) -> SimpleNamespace:
         u: wp.array(dtype=vector),
         force_out: wp.array(dtype=vector),
     ):
-        """Writes the change of force that one rounding of u makes."""
+        """Writes the change of force that one rounding of u makes: epsilon |A_ii| |u_i|."""
         i = wp.tid()
-        stiffness = scalar(float(dim)) / wp.trace(inverse_diagonal[i])
-        force_out[i] = (epsilon * stiffness) * u[i]
+        scale = wp.trace(inverse_diagonal[i])
+        block = wp.inverse(inverse_diagonal[i] / scale) / scale
+        force = vector()
+        for k in range(dim):
+            for j in range(dim):
+                force[k] += wp.abs(block[k, j] * u[i][j])
+        force_out[i] = epsilon * force
 
     return SimpleNamespace(
         add_scaled=add_scaled,
@@ -122,8 +127,7 @@ class _BackwardEulerStepper(Stepper):
         return [*own, *self.cg.arrays(), *self.operator.arrays()]
 
     def step(self, state: State, dt: float) -> StepReport:
-        if dt <= 0.0:
-            raise SimulationError(f"dt must be > 0, not {dt}")
+        require_positive(dt)
         model = self.model
         time = state.time + dt
         damping = model.scene.damping
@@ -133,7 +137,7 @@ class _BackwardEulerStepper(Stepper):
         if model.supports is not None:
             model.supports.advance(time, dt)
         if model.contact is not None:
-            model.contact.begin_friction(state.u)
+            model.contact.limit_friction(state.u)
         report = self._newton(state, time) if self.config.max_iterations > 1 else self._linearised(state, time)
         # v = (u - u_t) / dt, then u
         self._launch("add_scaled", [self._u, -1.0, state.u], [self._part])
@@ -149,6 +153,8 @@ class _BackwardEulerStepper(Stepper):
     # --- one linear system: the lecture's step ----------------------------------------------------------
 
     def _linearised(self, state: State, time: float) -> StepReport:
+        if self.model.contact is not None:
+            self.model.contact.linearize_friction(state.u, self._dt, self._predicted)
         wp.copy(self._u, state.u)
         self._hold(self._u)
         self._unbalanced_force(self._u)
@@ -165,13 +171,19 @@ class _BackwardEulerStepper(Stepper):
 
     def _newton(self, state: State, time: float) -> StepReport:
         config, model = self.config, self.model
+        rough = model.contact is not None and model.contact.rough
         potential = self._choose_start(state)
         if not np.isfinite(potential):
-            raise SimulationError(self._infinite_energy(state, time))
+            raise SimulationError(
+                f"t = {time:.6g} s: the step starts from infinite energy; {worst_cell(model, self._u)}. Start from a "
+                "state with J > 0, move supports more slowly, or take StableNeoHookean, which bears inversion"
+            )
         cg_iterations = 0
         note = f"stopped after {config.max_iterations} Newton iterations"
-        relative = np.inf
         for iteration in range(config.max_iterations + 1):
+            if rough and iteration > 0:
+                model.contact.limit_friction(self._u)
+                potential = self._potential(self._u)
             residual, scale = self._unbalanced_force(self._u)
             if not np.isfinite(residual):
                 require_finite(model, self._force, "the force", time)
@@ -186,7 +198,7 @@ class _BackwardEulerStepper(Stepper):
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             result = self._solve(forcing)
             cg_iterations += result.iterations
-            found = self._line_search(potential) if config.line_search else self._full_step()
+            found = self._line_search(potential, scale) if config.line_search else self._full_step()
             if found is None:
                 note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
                 break
@@ -199,7 +211,7 @@ class _BackwardEulerStepper(Stepper):
         self._hold(self._trial)
         wp.copy(self._u, state.u)
         self._hold(self._u)
-        still, flying = self._potential(self._u)[0], self._potential(self._trial)[0]
+        still, flying = self._potential(self._u), self._potential(self._trial)
         if flying < still or not np.isfinite(still):
             wp.copy(self._u, self._trial)
             return flying
@@ -213,15 +225,26 @@ class _BackwardEulerStepper(Stepper):
             arguments = [self._predicted, model.dead_load, model.inverse_mass, 1.0 / self._weight]
             self._launch("free_flight", arguments, [u_out])
 
-    def _line_search(self, potential: float) -> float | None:
-        """Backtracks from the full step until the potential falls enough (Armijo); None if it never does."""
-        slope = -self.model.dot(self._force, self._direction)
+    def _line_search(self, potential: float, scale: float) -> float | None:
+        """Backtracks from the full step until the potential falls enough (Armijo); None if it never does.
+
+        Near the minimum the fall drowns in the rounding of the potential, the work of the forces, of norm
+        ``scale``, over one rounding of u. There the slope decides, which rounding spares: it has to halve
+        (after Hager and Zhang 2005).
+        """
+        model = self.model
+        slope = -model.dot(self._force, self._direction)
+        typical = (model.dot(self._u, self._u) / model.point_count) ** 0.5
+        noise = 4.0 * model.types.epsilon * (abs(potential) + scale * typical)
         length = 1.0
         for _ in range(40):
             self._launch("add_scaled", [self._u, length, self._direction], [self._trial])
-            value, size = self._potential(self._trial)
-            slack = 4.0 * self.model.types.epsilon * size
-            if value <= potential + 1e-4 * length * slope + slack:
+            value = self._potential(self._trial)
+            fell = value <= potential + 1e-4 * length * slope
+            if not fell and value <= potential + noise:
+                self._unbalanced_force(self._trial)
+                fell = abs(model.dot(self._force, self._direction)) <= 0.5 * abs(slope)
+            if fell:
                 self._u, self._trial = self._trial, self._u
                 return value
             length *= 0.5
@@ -241,8 +264,8 @@ class _BackwardEulerStepper(Stepper):
         if self.model.supports is not None:
             self.model.supports.hold(u, self._part)  # the rates go to a work array
 
-    def _potential(self, u: wp.array) -> tuple[float, float]:
-        """Phi(u) and the sum of the sizes of its rounded terms."""
+    def _potential(self, u: wp.array) -> float:
+        """Phi(u)."""
         model, total = self.model, self._sum
         total.zero_()
         wp.launch(
@@ -257,9 +280,8 @@ class _BackwardEulerStepper(Stepper):
         if model.contact is not None:
             model.contact.add_energy(u, total)
             model.contact.add_friction_energy(self._start, self._dt, u, total)
-        size = float(total.numpy()[0])
         load = 0.0 if model.dead_load is None else model.dot(model.dead_load, u)
-        return size - load, abs(size)
+        return float(total.numpy()[0]) - load
 
     def _unbalanced_force(self, u: wp.array) -> tuple[float, float]:
         """Writes -dPhi/du to ``_force``, zero where held; returns its norm and that of the largest part."""
@@ -300,16 +322,6 @@ class _BackwardEulerStepper(Stepper):
         if self.model.supports is not None:
             self.model.supports.project(self._part)
         return float(np.sqrt(self.model.dot(self._part, self._part)))
-
-    def _infinite_energy(self, state: State, time: float) -> str:
-        jacobian, _ = self.model.diagnostics(state)
-        cell = int(np.argmin(jacobian))
-        body, own = self.model.body_of_cell(cell)
-        return (
-            f"t = {time:.6g} s: the step starts from infinite energy; cell {own} of body '{body.name}' has "
-            f"J = {jacobian[cell]:.4g}. Start from a state with J > 0, move supports more slowly, or take "
-            "StableNeoHookean, which bears inversion"
-        )
 
 
 @dataclass(frozen=True)
