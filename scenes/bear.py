@@ -1,4 +1,4 @@
-"""A teddy bear falls on a floor.
+"""A bear falls on a floor.
 
 Physics: stable Neo-Hookean elasticity, gravity, penalty contact with Coulomb friction; backward Euler.
 Units: SI. The closed surface ``bear.usd`` that comes with warp-lang, scaled to a height of 1 m and filled with
@@ -31,8 +31,8 @@ def mesh(edge_length: float) -> wf.Mesh:
 
 
 def scene(
-    edge_length: float = 0.08,
-    E: float = 4e4,
+    edge_length: float = 0.1,
+    E: float = 3e5,
     nu: float = 0.4,
     height: float = 0.4,
     tilt: float = 20.0,

@@ -15,6 +15,10 @@ from warpfem.model import Model, Route, State
 from warpfem.points import CHUNK, chunks
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_finite, require_positive, worst_cell
 
+FRICTION_UPDATES = 10
+"""Newton iterations of a step that take the friction limits of their iterate; later ones keep the last, so that
+they minimise one potential and cannot circle between two sets of sliding points."""
+
 
 @functools.cache
 def _implicit_kernels(dim: int, dtype: str) -> SimpleNamespace:
@@ -181,7 +185,7 @@ class _BackwardEulerStepper(Stepper):
         cg_iterations = 0
         note = f"stopped after {config.max_iterations} Newton iterations"
         for iteration in range(config.max_iterations + 1):
-            if rough and iteration > 0:
+            if rough and 0 < iteration <= FRICTION_UPDATES:
                 model.contact.limit_friction(self._u)
                 potential = self._potential(self._u)
             residual, scale = self._unbalanced_force(self._u)
@@ -228,20 +232,19 @@ class _BackwardEulerStepper(Stepper):
     def _line_search(self, potential: float, scale: float) -> float | None:
         """Backtracks from the full step until the potential falls enough (Armijo); None if it never does.
 
-        Near the minimum the fall drowns in the rounding of the potential, the work of the forces, of norm
-        ``scale``, over one rounding of u. There the slope decides, which rounding spares: it has to halve
-        (after Hager and Zhang 2005).
+        Near the minimum the fall drowns in the rounding of the potential: about the work of the forces, of
+        norm ``scale``, over one rounding of u. There a full step will do that halves the slope, which rounding
+        spares (after Hager and Zhang 2005).
         """
         model = self.model
         slope = -model.dot(self._force, self._direction)
-        typical = (model.dot(self._u, self._u) / model.point_count) ** 0.5
-        noise = 4.0 * model.types.epsilon * (abs(potential) + scale * typical)
+        noise = 16.0 * model.types.epsilon * (abs(potential) + scale * model.dot(self._u, self._u) ** 0.5)
         length = 1.0
         for _ in range(40):
             self._launch("add_scaled", [self._u, length, self._direction], [self._trial])
             value = self._potential(self._trial)
             fell = value <= potential + 1e-4 * length * slope
-            if not fell and value <= potential + noise:
+            if not fell and length == 1.0 and value <= potential + noise:
                 self._unbalanced_force(self._trial)
                 fell = abs(model.dot(self._force, self._direction)) <= 0.5 * abs(slope)
             if fell:
