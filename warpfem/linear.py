@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
+from warpfem.errors import SimulationError
 from warpfem.model import Model, Route
 from warpfem.points import CHUNK, chunks
 
@@ -436,7 +437,7 @@ def tangent_operator(model: Model, route: Route, *, clamped: bool = False, exter
     """
     operators = {"assembled": AssembledOperator, "closed": ClosedFormOperator, "tape": TapeOperator}
     if route not in operators:
-        raise ValueError(f"route must be one of {', '.join(map(repr, operators))}, not {route!r}")
+        raise SimulationError(f"route must be one of {', '.join(map(repr, operators))}, not {route!r}")
     return operators[route](model, clamped, external)
 
 

@@ -42,14 +42,18 @@ class State:
         self.revision = 0
 
     def assign(self, *, displacement: np.ndarray | None = None, velocity: np.ndarray | None = None) -> None:
-        """Overwrites displacements [m] or velocities [m/s], arrays (point_count, dim)."""
-        for target, value in ((self.u, displacement), (self.v, velocity)):
+        """Overwrites displacements [m] or velocities [m/s], arrays (point_count, dim).
+
+        Raises:
+            SimulationError: if one of them has another shape or is not finite; nothing is changed then.
+        """
+        arrays = []
+        for target, name, value in ((self.u, "displacement", displacement), (self.v, "velocity", velocity)):
             if value is not None:
-                array = np.asarray(value)
-                expected = (target.shape[0], target.dtype._length_)
-                if array.shape != expected:
-                    raise SimulationError(f"a state of this model takes shape {expected}, not {array.shape}")
-                target.assign(array.astype(wp.dtype_to_numpy(target.dtype._wp_scalar_type_)))
+                array = _point_vectors(f"the {name} of a state", value, (target.shape[0], target.dtype._length_))
+                arrays.append((target, array.astype(wp.dtype_to_numpy(target.dtype._wp_scalar_type_))))
+        for target, array in arrays:
+            target.assign(array)
         self.revision += 1
 
     def copy(self) -> State:
@@ -387,9 +391,8 @@ class Model:
         """
         from warpfem.linear import tangent_operator
 
-        p = self._device_array(np.asarray(direction), self.types.vector)
-        if p.shape != (self.point_count,):
-            raise SimulationError(f"a direction has shape {(self.point_count, self.dim)}, not {np.shape(direction)}")
+        vectors = _point_vectors("the direction", direction, (self.point_count, self.dim))
+        p = self._device_array(vectors, self.types.vector)
         operator = tangent_operator(self, route, clamped=False, external=False)
         operator.linearize(state.u, mass_weight=0.0)
         out = self.zeros()
@@ -475,6 +478,19 @@ class Model:
         """The body that a point of the model belongs to, and the point's number in its mesh."""
         body = int(np.searchsorted(self.point_starts, point, side="right")) - 1
         return self.scene.bodies[body], int(point - self.point_starts[body])
+
+
+def _point_vectors(what: str, value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SimulationError(f"{what} must be numbers of shape {shape}, not {value!r}") from None
+    if array.shape != shape:
+        raise SimulationError(f"{what} must have shape {shape} for this model, not {array.shape}")
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        raise SimulationError(f"{what} is not finite at point {int(np.argmax(bad))} ({int(bad.sum())} in all)")
+    return array
 
 
 def _lumped_mass(scene: Scene) -> np.ndarray:

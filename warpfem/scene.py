@@ -20,6 +20,11 @@ PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
 """One vector for all points, an array (point_count, dim), or a function of the rest points."""
 
 
+def _require_list(name: str, value: object) -> None:
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise SceneError(f"{name} must be a list, not {value!r}")
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """An elastic solid.
@@ -55,7 +60,12 @@ class Body:
                 f"body '{self.name}': material must be a warpfem material, for example "
                 f"StableNeoHookean(E=1e5, nu=0.45), not {self.material!r}"
             )
-        density = np.asarray(self.density, dtype=np.float64)
+        for name in ("supports", "loads"):
+            _require_list(f"body '{self.name}': {name}", getattr(self, name))
+        try:
+            density = np.asarray(self.density, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise SceneError(f"body '{self.name}': density must be a number, not {self.density!r}") from None
         if density.ndim > 1 or (density.ndim == 1 and len(density) != self.mesh.cell_count):
             raise SceneError(
                 f"body '{self.name}': density has shape {density.shape}, but the mesh has {self.mesh.cell_count} cells"
@@ -83,7 +93,11 @@ class Body:
         shape = self.mesh.points.shape
         if value is None:
             return np.zeros(shape)
-        array = np.asarray(value(self.mesh.points) if callable(value) else value, dtype=np.float64)
+        value = value(self.mesh.points) if callable(value) else value
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise SceneError(f"body '{self.name}': initial {name} must be numbers, not {value!r}") from None
         if array.shape not in (shape, shape[1:]):
             raise SceneError(
                 f"body '{self.name}': initial {name} has shape {array.shape}; expected {shape} or {shape[1:]}"
@@ -127,7 +141,8 @@ class Scene:
     dim: int = field(init=False)
 
     def __post_init__(self) -> None:
-        if not self.bodies or not all(isinstance(body, Body) for body in self.bodies):
+        is_list = isinstance(self.bodies, Sequence) and len(self.bodies) > 0
+        if not is_list or not all(isinstance(body, Body) for body in self.bodies):
             raise SceneError("a scene needs a list of at least one warpfem.Body")
         dims = {body.mesh.dim for body in self.bodies}
         if len(dims) != 1:
@@ -137,7 +152,7 @@ class Scene:
         for name in names:
             if names.count(name) > 1:
                 raise SceneError(f"{names.count(name)} bodies are named '{name}': give each its own name")
-        if not callable(getattr(self.solver, "stepper", None)):
+        if isinstance(self.solver, type) or not callable(getattr(self.solver, "stepper", None)):
             raise SceneError(f"solver must be a warpfem solver, for example BackwardEuler(), not {self.solver!r}")
         self._check_number("fps", self.fps, positive=True)
         self._check_number("damping", self.damping)
@@ -151,6 +166,7 @@ class Scene:
             raise SceneError(f"color_by must be 'von_mises' or 'jacobian', not {self.color_by!r}")
         if self.gravity is not None:
             self._check_vector("gravity", self.gravity)
+        _require_list("obstacles", self.obstacles)
         for obstacle in self.obstacles:
             if not isinstance(obstacle, Obstacle):
                 raise SceneError(f"an obstacle must be a Plane, Sphere or BoxWalls, not {obstacle!r}")
