@@ -307,9 +307,7 @@ def test_state_refuses_what_is_no_number(wrong):
     assert state.revision == 0
 
 
-@pytest.mark.parametrize(
-    "wrong", [np.zeros((3, 2)), np.zeros((4, 3)), np.zeros(4), np.zeros(8), np.zeros((4, 2, 1)), 0.0]
-)
+@pytest.mark.parametrize("shape", [(3, 2), (4, 3), (4,), (8,), (4, 2, 1), ()])
 def test_differential_refuses_other_shapes(shape):
     model = model_of(SOFT, square())
     with pytest.raises(SimulationError, match=r"the direction must have shape \(4, 2\)"):
