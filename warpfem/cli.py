@@ -13,7 +13,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import warpfem
-from warpfem.errors import OutputError, SimulationError, WarpfemError
+from warpfem.errors import SimulationError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 
@@ -121,11 +121,6 @@ def _run(arguments: argparse.Namespace) -> int:
     _quiet_warp()
     scene = _load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
-    if arguments.out is None:
-        try:
-            out.parent.mkdir(exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{out.parent} cannot be made ({error.strerror}): choose a file with --out") from None
     say = not (arguments.quiet or arguments.json)
     if say:
         print(f"{arguments.scene}: preparing (the first run of a scene compiles its kernels)", file=sys.stderr)
@@ -138,11 +133,11 @@ def _run(arguments: argparse.Namespace) -> int:
             pass
     except KeyboardInterrupt:
         code = _fail(SimulationError(f"interrupted: {summary.frames} frames are in {out}"), FAILED)
-    except SimulationError as error:
+    except WarpfemError as error:
+        if not summary.frames:
+            raise
         error.add_note(f"{summary.frames} frames are in {out}")
         code = _fail(error, FAILED)
-    except OutputError as error:
-        return _fail(error, FAILED if summary.steps else WRONG_USE)
     if arguments.json:
         print(json.dumps(_summary_data(summary, arguments, out), indent=2))
     elif not arguments.quiet:

@@ -1,0 +1,229 @@
+"""The command line: what it prints, writes and returns."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warpfem as wf
+from warpfem.cli import FAILED, OK, WRONG_USE, main
+from warpfem.usd import read_animation
+
+SCENES = Path(__file__).parent.parent / "scenes"
+BARS = str(SCENES / "two_materials.py")
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    def write(body: str, name: str = "small.py") -> str:
+        path = tmp_path / name
+        path.write_text("import warpfem as wf\n" + body)
+        return str(path)
+
+    return write
+
+
+def test_run_writes_the_animation_and_a_summary(tmp_path, capsys):
+    out = tmp_path / "bars.usdc"
+    assert main(["run", BARS, "--out", str(out), "--frames", "3", "--fps", "12", "--set", "cells=1"]) == OK
+    printed = capsys.readouterr().out
+    for text in ("4 frames, 12 steps", "energy [J]: kinetic 0", "largest von Mises stress", "Newton", f"wrote {out}"):
+        assert text in printed
+    assert "penetration" not in printed  # the scene has no obstacles
+    animation = read_animation(out)
+    assert (animation.frame_count, animation.fps) == (4, 12)
+    assert [body.name for body in animation.bodies] == ["stiff", "soft"]
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_frames_in_the_file_are_those_of_the_simulation(tmp_path):
+    from warpfem.scene_file import load_scene
+
+    out = tmp_path / "bars.usdc"
+    assert main(["run", BARS, "--out", str(out), "--frames", "2", "--set", "cells=1", "--quiet"]) == OK
+    scene = load_scene(BARS, {"cells": "1"})
+    simulation = wf.Simulation(scene, device="cpu")
+    frames = simulation.frames()
+    animation = read_animation(out)
+    for index in range(3):
+        expected = simulation.model.rest_points + next(frames).displacement
+        stored = np.concatenate([body.points for body in animation.frame(index)])
+        np.testing.assert_array_equal(stored.astype(np.float32), expected.astype(np.float32))
+
+
+def test_json_is_the_only_output(tmp_path, capsys):
+    out = tmp_path / "bars.usdc"
+    assert main(["run", BARS, "--out", str(out), "--frames", "1", "--set", "cells=1", "--json"]) == OK
+    captured = capsys.readouterr()
+    summary = json.loads(captured.out)
+    assert summary["frames"] == 2
+    assert summary["steps"] == 2
+    assert summary["newton_iterations"] > 0
+    assert summary["unconverged_steps"] == 0
+    assert summary["last_energies"]["elastic"] > 0.0
+    assert summary["file"] == str(out)
+    assert captured.err == ""
+
+
+def test_quiet_prints_nothing(tmp_path, capsys):
+    assert main(["run", BARS, "--out", str(tmp_path / "a.usdc"), "--frames", "0", "--quiet"]) == OK
+    assert capsys.readouterr() == ("", "")
+
+
+def test_default_output_is_named_after_the_scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", BARS, "--frames", "0", "--quiet"]) == OK
+    assert (tmp_path / "output" / "two_materials.usdc").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "missing.py"], "no scene file 'missing.py'"),
+        (["run", "scenes"], "no scene file"),
+        (["run", BARS, "--set", "cell=2"], "no parameter 'cell'; did you mean 'cells'?"),
+        (["run", BARS, "--set", "cells=two"], "cells must be of type int, like 2, not 'two'"),
+        (["run", BARS, "--set", "cells"], "--set takes NAME=VALUE"),
+        (["run", BARS, "--set", "cells=0"], "cells"),
+        (["run", BARS, "--set", "E=-1"], "E must be finite and > 0: got -1"),
+        (["run", BARS, "--frames", "-1"], "frames must be an integer >= 0"),
+        (["run", BARS, "--fps", "0"], "fps must be a finite number > 0"),
+        (["run", BARS, "--device", "gpu"], "no device 'gpu'"),
+        (["run", BARS, "--out", "/dev/null/a.usdc"], "/dev/null"),
+        (["run", BARS, "--out", "a.txt"], "a.txt"),
+        (["preview", "missing.usdc", "--out", "a.png"], "missing.usdc"),
+    ],
+)
+def test_wrong_use_is_one_message_and_no_file(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    if arguments[0] == "run" and "--out" not in arguments:
+        arguments = [*arguments, "--out", "a.usdc"]
+    assert main(arguments) == WRONG_USE
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warpfem:")]
+    assert len(errors) == 1
+    assert message in errors[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("def scene(:\n", "line 2"),
+        ("x = 1\n", "does not define a function scene"),
+        ("def scene():\n    return 3\n", "must return a warpfem.Scene, not int"),
+        ("def scene():\n    return wf.Scene([], wf.BackwardEuler())\n", "at least one warpfem.Body"),
+        ("def scene():\n\n    return 1 / 0\n", "line 4: ZeroDivisionError"),
+    ],
+)
+def test_errors_in_a_scene_file_name_file_and_line(scene_file, capsys, body, message):
+    path = scene_file(body)
+    assert main(["run", path, "--quiet"]) == WRONG_USE
+    printed = capsys.readouterr().err
+    assert path in printed or "at least one" in message
+    assert message in printed
+    assert "Traceback" not in printed
+
+
+DIVERGING = """
+import numpy as np
+
+def scene():
+    def motion(rest, time):
+        return rest + (0, 0.1, 0) if time < 0.3 else rest * np.nan
+    mesh = wf.Mesh.box((1, 1, 1), (1, 1, 1))
+    body = wf.Body("cube", mesh, wf.StableNeoHookean(E=1e5, nu=0.3), supports=[wf.PrescribedMotion("top", motion)])
+    return wf.Scene([body], wf.VelocityVerlet(), dt=1e-3, fps=10, frames=10)
+"""
+
+
+def test_a_failed_run_keeps_its_frames(tmp_path, scene_file, capsys):
+    out = tmp_path / "cube.usdc"
+    assert main(["run", scene_file(DIVERGING), "--out", str(out), "--quiet"]) == FAILED
+    printed = capsys.readouterr().err
+    assert "not finite at t = 0.3" in printed
+    assert f"3 frames are in {out}" in printed
+    assert read_animation(out).frame_count == 3
+
+
+def test_a_dt_above_the_limit_is_refused_before_anything_is_written(tmp_path, capsys):
+    out = tmp_path / "bar.usdc"
+    assert main(["run", str(SCENES / "stretch.py"), "--set", "dt=0.5", "--out", str(out)]) == FAILED
+    assert "above the stability limit" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_run_leaves_its_frames(tmp_path):
+    out = tmp_path / "jelly.usdc"
+    command = [sys.executable, "-m", "warpfem", "run", str(SCENES / "jelly_drop.py"), "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    partial = tmp_path / "jelly.partial.usda"
+    frames = 0
+    deadline = time.monotonic() + 120
+    while frames < 3 and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.2)
+        if partial.is_file():
+            frames = read_animation(partial).frame_count
+    assert process.poll() is None, "the run ended before it could be killed"
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not out.exists()
+    left = read_animation(partial)
+    assert left.frame_count >= 3
+    for index in range(left.frame_count):
+        (body,) = left.frame(index)
+        assert np.isfinite(body.points).all()
+    heights = [left.frame(index)[0].points[:, 1].mean() for index in range(3)]
+    assert heights[0] > heights[1] > heights[2]  # it falls
+
+
+def test_interrupt_ends_cleanly(tmp_path):
+    out = tmp_path / "jelly.usdc"
+    command = [sys.executable, "-m", "warpfem", "run", str(SCENES / "jelly_drop.py"), "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    partial = tmp_path / "jelly.partial.usda"
+    while process.poll() is None and not (partial.is_file() and read_animation(partial).frame_count >= 2):
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, printed = process.communicate(timeout=60)
+    assert process.returncode == FAILED
+    assert "interrupted" in printed and "Traceback" not in printed
+    assert read_animation(out).frame_count >= 2
+
+
+def test_explain_says_what_is_on_and_off(capsys):
+    assert main(["explain", BARS, "--set", "cells=1", "--frames", "1"]) == OK
+    printed = capsys.readouterr().out
+    lines = {line.split()[0]: line.split()[1] for line in printed.splitlines() if line.startswith("  ")}
+    assert lines["gravity"] == lines["supports"] == lines["damping"] == lines["elasticity"] == "on"
+    assert lines["contact"] == lines["friction"] == lines["loads"] == "off"
+    assert "linear (48 cells)" not in printed and "linear (20 cells)" in printed
+    assert "element_stiffness" in printed
+    assert "Device memory" in printed
+
+
+def test_info(capsys):
+    assert main(["info"]) == OK
+    printed = capsys.readouterr().out
+    for text in (f"warpfem {wf.__version__}", "warp-lang", "numpy", "usd-core", "devices: cpu"):
+        assert text in printed
+
+
+def test_help_names_every_command(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--help"])
+    assert end.value.code == 0
+    printed = capsys.readouterr().out
+    for command in ("run", "explain", "preview", "info"):
+        assert command in printed
+
+
+def test_missing_command_is_wrong_use(capsys):
+    with pytest.raises(SystemExit) as end:
+        main([])
+    assert end.value.code == WRONG_USE

@@ -1,0 +1,158 @@
+"""The frame loop, its summary, and what a scene does not require."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import warpfem as wf
+from warpfem.explain import explain
+from warpfem.model import device_bytes
+
+
+def cube(**settings) -> wf.Scene:
+    body = {key: settings.pop(key) for key in ("supports", "loads", "displacement") if key in settings}
+    mesh = wf.Mesh.box((1, 1, 1), (1, 1, 1))
+    material = settings.pop("material", wf.StableNeoHookean(E=1e5, nu=0.3))
+    settings.setdefault("solver", wf.BackwardEuler())
+    return wf.Scene([wf.Body("cube", mesh, material, **body)], **settings)
+
+
+def test_frames_are_at_multiples_of_the_interval():
+    simulation = wf.Simulation(cube(gravity=(0, -10, 0), dt=0.03, fps=10, frames=4))
+    frames = list(simulation.frames())
+    assert simulation.steps_per_frame == 4
+    assert simulation.dt == pytest.approx(0.025)
+    np.testing.assert_allclose([frame.time for frame in frames], [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert [frame.index for frame in frames] == [0, 1, 2, 3, 4]
+    assert simulation.summary.steps == 16
+    assert simulation.summary.frames == 5
+    n = 16  # free fall by backward Euler: u = g dt^2 n (n + 1) / 2
+    np.testing.assert_allclose(frames[-1].displacement[:, 1], -10 * 0.025**2 * n * (n + 1) / 2, rtol=1e-5)
+
+
+def test_zero_frames_give_the_initial_state():
+    simulation = wf.Simulation(cube(frames=0, displacement=(0.5, 0, 0)))
+    (frame,) = simulation.frames()
+    np.testing.assert_array_equal(frame.displacement[:, 0], 0.5)
+    assert simulation.summary.steps == 0
+
+
+@pytest.mark.parametrize("dt", [1e-3, 1 / 24])
+def test_a_dt_that_divides_the_interval_is_kept(dt):
+    assert wf.Simulation(cube(dt=dt, fps=1 / (dt * round(1 / 24 / dt)), frames=1)).dt == pytest.approx(dt)
+
+
+def test_auto_dt_is_half_the_limit_for_explicit_steps_and_the_interval_for_implicit_ones():
+    explicit = wf.Simulation(cube(solver=wf.VelocityVerlet(), frames=1))
+    assert explicit.dt <= 0.5 * explicit.stepper.stable_dt() < 1.5 * explicit.dt
+    assert wf.Simulation(cube(frames=1)).dt == pytest.approx(1 / 24)
+
+
+def test_the_step_thrown_away_leaves_no_trace():
+    scene = cube(gravity=(0, -10, 0), dt=1 / 24, frames=1)
+    simulation = wf.Simulation(scene)
+    first, _ = simulation.frames()
+    np.testing.assert_array_equal(first.displacement, 0.0)
+    np.testing.assert_array_equal(first.velocity, 0.0)
+    assert simulation.state.time == pytest.approx(1 / 24)
+
+
+def test_summary_counts_unconverged_steps():
+    hard = cube(
+        supports=[wf.Pin("bottom")],
+        loads=[wf.Traction("top", (0, -2e5, 0))],
+        solver=wf.BackwardEuler(max_iterations=2, tolerance=1e-9),
+        frames=2,
+    )
+    simulation = wf.Simulation(hard, dtype="float64")
+    list(simulation.frames())
+    assert simulation.summary.unconverged_steps == 2
+    assert simulation.summary.worst_residual > 1e-9
+    assert "2 Newton iterations" in simulation.summary.worst_note
+
+
+def test_a_run_that_breaks_down_names_time_body_and_cell():
+    # Neo-Hookean, explicit, squashed through itself
+    def squash(rest, time):
+        return rest * (1.0, 1.0 - 40.0 * time, 1.0)
+
+    scene = cube(
+        material=wf.NeoHookean(E=1e5, nu=0.3),
+        supports=[wf.Pin("bottom"), wf.PrescribedMotion("top", squash)],
+        solver=wf.VelocityVerlet(),
+        dt=1e-3,
+        frames=4,
+    )
+    simulation = wf.Simulation(scene)
+    good = []
+    with pytest.raises(wf.SimulationError, match=r"t = 0\.0\d+ s: .* of body 'cube'"):
+        for frame in simulation.frames():
+            good.append(frame)
+    assert len(good) >= 1
+    assert all(np.isfinite(frame.displacement).all() for frame in good)
+
+
+TERMS = {
+    "contact": dict(obstacles=[wf.Plane((0, -1, 0), (0, 1, 0))]),
+    "friction": dict(obstacles=[wf.Plane((0, -1, 0), (0, 1, 0), friction=0.5)]),
+    "supports": dict(supports=[wf.Pin("bottom")]),
+    "gravity": dict(gravity=(0, -9.81, 0)),
+    "loads": dict(loads=[wf.PointForce("top", (1, 0, 0))]),
+    "damping": dict(damping=1.0),
+}
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_explain_reports_the_term_that_is_on(term):
+    explanation = explain(wf.Simulation(cube(frames=1, **TERMS[term])))
+    on = {t.name for t in explanation.terms if t.on}
+    assert on == {"elasticity", term} | ({"contact"} if term == "friction" else set())
+
+
+def test_a_term_that_is_off_costs_nothing():
+    bare = wf.Simulation(cube(frames=1, displacement=lambda x: 0.01 * x))
+    explanation = explain(bare)
+    names = {use.name for use in explanation.kernels}
+    modules = {use.module for use in explanation.kernels}
+    assert bare.model.contact is None and bare.model.supports is None and bare.model.dead_load is None
+    assert not [module for module in modules if "contact" in module or "supports" in module]
+    for term, settings in TERMS.items():
+        richer = explain(wf.Simulation(cube(frames=1, displacement=lambda x: 0.01 * x, **settings)))
+        assert names <= {use.name for use in richer.kernels}
+        more = richer.model_bytes + richer.solver_bytes
+        less = explanation.model_bytes + explanation.solver_bytes
+        assert more == less if term == "damping" else more > less  # damping is a number
+
+
+def test_what_a_scene_lacks_is_not_imported():
+    code = """
+import sys, warp as wp
+wp.config.log_level = wp.LOG_ERROR
+import warpfem as wf
+body = wf.Body("a", wf.Mesh.box((1, 1, 1), (1, 1, 1)), wf.LinearElasticity(E=1e5, nu=0.3))
+simulation = wf.Simulation(wf.Scene([body], wf.BackwardEuler(), frames=1), device="cpu")
+list(simulation.frames())
+heavy = {"pxr", "matplotlib", "meshio", "pytetwild", "tqdm", "warpfem.contact", "warpfem.supports", "warpfem.usd"}
+print(sorted(heavy & set(sys.modules)))
+"""
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.strip().splitlines()[-1] == "[]"
+
+
+def test_device_bytes_count_a_uniform_array_once():
+    scene = cube(frames=1)
+    model = wf.Model(scene)
+    parameters = model.blocks[0].arguments[3]
+    assert parameters.shape == (5,)
+    assert device_bytes([parameters]) == 2 * 4
+    assert device_bytes([model.mass]) == 8 * 4
+
+
+def test_run_returns_the_summary_and_writes_the_file(tmp_path):
+    out = tmp_path / "cube.usdc"
+    summary = wf.run(cube(frames=2, gravity=(0, -10, 0)), out, device="cpu")
+    assert summary.frames == 3
+    assert summary.last_energies.kinetic > 0.0
+    assert out.is_file()
