@@ -82,7 +82,7 @@ def preview(path: str | Path, out: str | Path, *, frames: int | None = None) -> 
         import matplotlib.figure  # noqa: F401
         import PIL.Image  # noqa: F401
     except ImportError as error:
-        raise MissingExtraError("drawing a preview", error.name or "matplotlib", "plot") from error
+        raise MissingExtraError("drawing a preview", "matplotlib", "plot") from error
     animation = read_animation(path)
     if not animation.frame_count:
         raise OutputError(f"{path} has no frames to draw: the run ended before the first one was saved")
@@ -131,7 +131,9 @@ def _film(animation: Animation, scene: _Scene, most: int) -> bytes:
         page.show([scene.image(animation.frame(index))], [index])
         images.append(Image.fromarray(page.pixels()))
     some = np.concatenate([np.asarray(image) for image in images[:: math.ceil(len(images) / 8)]])
-    palette = Image.fromarray(some).quantize(256)  # one for all frames, or colours would flicker
+    palette = Image.fromarray(some).quantize(
+        256, Image.Quantize.FASTOCTREE
+    )  # one for all frames, or colours would flicker
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # GIF counts hundredths of a second: rounding the times keeps the pace where rounding the delays would not.
     times = 10 * np.round(100.0 / animation.fps * np.array([*chosen, animation.frame_count])).astype(int)
