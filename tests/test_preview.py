@@ -177,6 +177,15 @@ def test_bodies_move_and_the_camera_does_not(tmp_path: Path, dim: int, up_axis: 
         assert shift[0] / -rise[0] == pytest.approx(slope, rel=0.05)
 
 
+@pytest.mark.parametrize("offset", [0.0, 1e5])
+def test_the_view_fits_what_it_shows(tmp_path: Path, offset: float) -> None:
+    path = write(tmp_path / "run.usdc", 2, 1, move=lambda points, index: points + offset)
+    panel = drawn(pictures(preview(path, tmp_path / "sheet.png"))[0][0])
+    first, last = (end(np.argwhere(panel), axis=0) for end in (np.min, np.max))
+    assert first == pytest.approx(np.array(panel.shape) - 1 - last, abs=2)
+    assert (last + 1 - first) / panel.shape == pytest.approx(1 / 1.06, abs=0.01)
+
+
 @pytest.mark.parametrize("value", [4e3, 2e4])
 def test_colors_are_those_of_the_scale(tmp_path: Path, value: float) -> None:
     expected = np.round(255 * ColorScale("von_mises", 0.0, 2e4).srgb(np.array([value])))[0]
@@ -185,6 +194,7 @@ def test_colors_are_those_of_the_scale(tmp_path: Path, value: float) -> None:
         (sheet,), _ = pictures(preview(path, tmp_path / "sheet.png"))
         shades, counts = np.unique(sheet[colored(sheet)], axis=0, return_counts=True)
         shade = shades[counts.argmax()]
+        assert (counts > 0.1 * counts.sum()).sum() == (1 if dim == 2 else 3)  # each face of the cube has its own
         if dim == 2:
             assert np.abs(shade - expected).max() <= 1
         else:  # the same hue, in light and shade
@@ -222,6 +232,8 @@ def test_a_shadow_lies_straight_below_the_body(tmp_path: Path) -> None:
     path = write(tmp_path / "run.usdc", 3, 3, move=moved_by(*heights), obstacles=[Plane((0, -0.1, 0), (0, 1, 0))])
     frames, _ = pictures(preview(path, tmp_path / "film.gif"))
     shadows = [((frame.max(axis=2) < 170) & ~colored(frame))[24:] for frame in frames]
+    floor = frames[2][(np.ptp(frames[2], axis=2) < 4) & (np.abs(frames[2][..., 0] - 195) < 20)]
+    assert (np.unique(floor[:, 0], return_counts=True)[1] > 0.2 * len(floor)).sum() == 2  # tiles
     low, middle, high = (shadow.sum() for shadow in shadows)
     assert 0 < low < 0.7 * middle  # the body hides the rest
     assert middle == pytest.approx(high, rel=0.02)
