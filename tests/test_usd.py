@@ -462,6 +462,21 @@ def test_an_old_output_stays_until_the_new_one_is_complete(tmp_path: Path) -> No
     assert np.array_equal(animation.frame(2)[0].points, lifted(frames[2][0].points).astype(np.float32))
 
 
+def test_a_partial_file_is_read_as_it_is_now(tmp_path: Path) -> None:
+    """An animation that is still held must not hide that other chunks have taken its place."""
+    path, body = tmp_path / "run.usdc", make_body(2)
+    held = []
+    for first, per_chunk in ((0, 1), (10, 3)):
+        writer = UsdWriter(path, [body], fps=24, frames_per_chunk=per_chunk)
+        frames = [make_frame(body, first + index) for index in range(6)]
+        for frame in frames:
+            writer.write_frame([frame])
+        held.append(read_animation(tmp_path / "run.partial.usda"))
+        for index, frame in enumerate(frames):
+            points = held[-1].frame(index)[0].points
+            assert np.array_equal(points, lifted(frame.points).astype(np.float32))
+
+
 CHILD = """
 import sys
 sys.path[:0] = [{repository!r}, {tests!r}]
@@ -641,9 +656,7 @@ def test_tet_meshes_come_in_metres_and_in_the_world(tmp_path: Path, authored, un
     assert cells.tolist() == [[0, 1, 2, 3]]
 
 
-@pytest.mark.parametrize(
-    ("orientation", "cell"), [("rightHanded", (0, 1, 2, 3)), ("leftHanded", (0, 2, 1, 3))]
-)
+@pytest.mark.parametrize(("orientation", "cell"), [("rightHanded", (0, 1, 2, 3)), ("leftHanded", (0, 2, 1, 3))])
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_tet_meshes_come_with_positive_volumes(tmp_path: Path, orientation: str, cell, mirror: int) -> None:
     author_tets(tmp_path / "a.usda", [cell], orientation=orientation, scale=(mirror, 1, 1)).Save()
@@ -667,9 +680,7 @@ def test_surfaces_are_merged_and_cut_into_triangles(tmp_path: Path) -> None:
     stage = Usd.Stage.CreateNew(str(path))
     for name, height in (("low", 0.0), ("high", 1.0), ("hidden", 2.0)):
         mesh = UsdGeom.Mesh.Define(stage, f"/{name}")
-        mesh.CreatePointsAttr(
-            [(0, 0, height), (1, 0, height), (1, 1, height), (0, 1, height), (-1, 0.5, height)]
-        )
+        mesh.CreatePointsAttr([(0, 0, height), (1, 0, height), (1, 1, height), (0, 1, height), (-1, 0.5, height)])
         mesh.CreateFaceVertexCountsAttr([3, 5])
         mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 0, 1, 2, 3, 4])
         if name == "high":
@@ -692,10 +703,7 @@ def test_the_bear_that_comes_with_warp_is_closed_and_outward() -> None:
     assert np.ptp(points, axis=0) == pytest.approx((4.89, 5.542, 9.78), abs=1e-3)
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
     assert np.einsum("ij,ij->", np.cross(a, b), c) / 6.0 > 10.0
-    edges = {
-        tuple(edge)
-        for edge in np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    }
+    edges = {tuple(edge) for edge in np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])}
     assert len(edges) == 3 * 3968 and all((end, start) in edges for start, end in edges)
 
 
@@ -722,9 +730,7 @@ def test_unreadable_meshes_are_errors(tmp_path: Path, read) -> None:
 
 def test_meshes_that_make_no_sense_are_errors(tmp_path: Path) -> None:
     author_tets(tmp_path / "range.usda", [(0, 1, 2, 3), (0, 1, 2, 4)]).Save()
-    with pytest.raises(
-        MeshError, match="1 indices are outside of its 4 points, the first one is 4 at position 7"
-    ):
+    with pytest.raises(MeshError, match="1 indices are outside of its 4 points, the first one is 4 at position 7"):
         read_tet_mesh(tmp_path / "range.usda")
     author_tets(tmp_path / "empty.usda", np.empty((0, 4))).Save()
     with pytest.raises(MeshError, match="/root/tets: the mesh is empty"):
