@@ -17,24 +17,10 @@ from warpfem.tensor import (
     deformation_gradient,
     embed,
     identity_like,
-    mat22,
-    mat33,
+    is_positive_definite,
     signed_svd,
     volume_change,
 )
-
-
-@wp.func
-def _is_positive(A: mat22):
-    """Whether a symmetric matrix is positive definite (Sylvester's criterion)."""
-    return A[0, 0] > A.dtype(0.0) and wp.determinant(A) > A.dtype(0.0)
-
-
-@wp.func
-def _is_positive(A: mat33):
-    zero = A.dtype(0.0)
-    minor = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-    return A[0, 0] > zero and minor > zero and wp.determinant(A) > zero
 
 
 @wp.func
@@ -47,7 +33,7 @@ def _clamped(A: Any):
 @wp.func
 def _positive_part(A: Any):
     """The symmetric matrix A with its negative eigenvalues set to zero."""
-    if _is_positive(A):
+    if is_positive_definite(A):
         return A
     shift = wp.sqrt(wp.ddot(A, A))
     V, _s, _V = signed_svd(A + shift * identity_like(A))  # positive semi-definite: V holds eigenvectors
@@ -111,6 +97,8 @@ class ElementKernels:
     @functools.cached_property
     def taped_force(self) -> wp.Kernel:
         """:attr:`force` with its adjoint, for ``wp.Tape``."""
+        if not self.constitutive.differentiable:
+            raise TypeError("Warp cannot differentiate the stress of this material")
         return self._force_kernel(enable_backward=True)
 
     def _force_kernel(self, enable_backward: bool) -> wp.Kernel:

@@ -16,8 +16,9 @@ import warp as wp
 
 from warpfem.dtypes import types
 from warpfem.errors import SimulationError
-from warpfem.model import Model, Route
+from warpfem.model import CellBlock, Model, Route
 from warpfem.points import CHUNK, chunks
+from warpfem.tensor import is_positive_definite
 
 # Entries of the float64 array of scalars that conjugate gradients keep on the device.
 _RHO = wp.constant(0)  # r . z
@@ -58,14 +59,14 @@ def operator_kernels(dim: int, dtype: str) -> SimpleNamespace:
         diagonal: wp.array(dtype=wp.int32),
         inverse_out: wp.array(dtype=matrix),
     ):
-        """Inverts the diagonal block of each point; one that is not positive definite becomes the identity."""
+        """Inverts the diagonal block of each point, or its mean, where it is not positive definite."""
         i = wp.tid()
         block = blocks[diagonal[i]]
         inverse = wp.identity(n=dim, dtype=scalar)
         scale = wp.trace(block) / scalar(float(dim))
         if scale > scalar(0.0):
             relative = block / scale
-            if wp.determinant(relative) > scalar(1.0e-12):
+            if is_positive_definite(relative) and wp.determinant(relative) > scalar(1.0e-12):
                 inverse = wp.inverse(relative) / scale
             else:
                 inverse = wp.identity(n=dim, dtype=scalar) / scale
@@ -398,7 +399,10 @@ class ClosedFormOperator(_UnassembledOperator):
 
 
 class TapeOperator(_UnassembledOperator):
-    """A with K p from ``wp.Tape``: the adjoint of the force kernel, with p as the force's adjoint."""
+    """A with K p from ``wp.Tape``: the adjoint of the force kernel, with p as the force's adjoint.
+
+    A material whose stress Warp cannot differentiate puts its own differential on the tape.
+    """
 
     def __init__(self, model: Model, clamped: bool, external: bool) -> None:
         if clamped:
@@ -415,7 +419,16 @@ class TapeOperator(_UnassembledOperator):
         if self._tape is None:
             with wp.Tape() as self._tape:
                 for block in self.model.blocks:
-                    block.launch("taped_force", [self._u], [self._force])
+                    if block.kernels.constitutive.differentiable:
+                        block.launch("taped_force", [self._u], [self._force])
+                    else:
+                        backward = functools.partial(self._subtract_closed_form, block)
+                        self._tape.record_func(backward, [self._u, self._force])
+
+    def _subtract_closed_form(self, block: CellBlock) -> None:
+        product = self.model.zeros()
+        block.launch("differential", [self._u, self._force.grad], [product])
+        self._launch(self.kernels.subtract, [product], [self._u.grad])
 
     def _add_stiffness_product(self, p, product_out) -> None:
         self._tape.backward(grads={self._force: p})

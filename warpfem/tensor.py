@@ -179,6 +179,19 @@ def in_plane(A: mat33, like: mat33):  # noqa: F811
     return A
 
 
+@wp.func
+def is_positive_definite(A: mat22):
+    """Whether a symmetric matrix is positive definite (Sylvester's criterion)."""
+    return A[0, 0] > A.dtype(0.0) and wp.determinant(A) > A.dtype(0.0)
+
+
+@wp.func
+def is_positive_definite(A: mat33):  # noqa: F811
+    zero = A.dtype(0.0)
+    minor = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    return A[0, 0] > zero and minor > zero and wp.determinant(A) > zero
+
+
 # --- singular values -------------------------------------------------------------------------------------
 
 

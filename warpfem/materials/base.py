@@ -24,6 +24,8 @@ class Constitutive:
         parameter_count: length of the vector of parameters.
         isotropic: whether psi depends on the principal stretches of F alone.
         convex: whether d²psi/dF² is positive semi-definite for every F.
+        differentiable: whether Warp can differentiate ``stress``: not if it calls ``wp.grad``, through which
+            gradients silently do not flow.
     """
 
     energy_density: Any
@@ -32,6 +34,7 @@ class Constitutive:
     parameter_count: int = 2
     isotropic: bool = True
     convex: bool = False
+    differentiable: bool = True
 
 
 class Material(ABC):

@@ -106,9 +106,6 @@ def _constitutive(psi: Any, parameter_count: int, isotropic: bool) -> Constituti
             P, _gradient = wp.grad(psi)(deformation_gradient(_solid_matrix(H)), to_double(parameters))
             return in_plane(_cast(P, H[0, 0]), H)
 
-        # The two functions below do the same: Warp emits custom gradients before any function that calls
-        # wp.grad, so that the second cannot call the first.
-
         @wp.func(name=f"{name}_stress_differential")
         def stress_differential(H: matrix, dH: matrix, parameters: vector):
             F, offset, inverse_length = _probe(H, dH)
@@ -117,24 +114,18 @@ def _constitutive(psi: Any, parameter_count: int, isotropic: bool) -> Constituti
             behind, _behind = wp.grad(psi)(F - offset, p)
             return in_plane(_cast((ahead - behind) * inverse_length, H[0, 0]), H)
 
-        @wp.func_grad(stress)
-        def adjoint_stress(H: matrix, parameters: vector, adjoint: matrix):
-            F, offset, inverse_length = _probe(H, adjoint)
-            p = to_double(parameters)
-            ahead, _ahead = wp.grad(psi)(F + offset, p)
-            behind, _behind = wp.grad(psi)(F - offset, p)
-            wp.adjoint[H] += in_plane(_cast((ahead - behind) * inverse_length, H[0, 0]), H)
-
-    return Constitutive(energy_density, stress, stress_differential, parameter_count, isotropic=isotropic)
+    return Constitutive(
+        energy_density, stress, stress_differential, parameter_count, isotropic=isotropic, differentiable=False
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class EnergyMaterial(Material):
     """A hyperelastic material given by its energy density psi(F) alone.
 
-    The stress is the exact derivative of psi by Warp; the stress differential is its central difference,
-    with a relative error of about 1e-9. Both are evaluated in float64 whatever the precision of the state,
-    so psi need not be written with care for cancellation near rest.
+    The stress is the exact derivative of psi by Warp; the stress differential is its central difference, by
+    every route, with a relative error of about 1e-9. Both are evaluated in float64 whatever the precision of
+    the state, so psi need not be written with care for cancellation near rest.
 
     Attributes:
         psi: a ``@wp.func`` ``psi(F: wp.mat33d, parameters: Any)`` that returns the energy density [J/m^3] as
