@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import random
 import re
 import signal
@@ -360,6 +361,19 @@ def test_colors_of_the_volume_ratio_are_symmetric_about_one(tmp_path: Path) -> N
     assert np.ptp(rest) < 0.05 and compressed.argmax() == 2 and stretched.argmax() == 0
 
 
+def test_one_singular_corner_does_not_set_the_color_range(tmp_path: Path) -> None:
+    body = make_body(2, cells=40)
+    stress = np.ones(len(body.cells))
+    stress[0] = 1e6
+    with UsdWriter(tmp_path / "run.usdc", [body], fps=24) as writer:
+        writer.write_frame([BodyFrame(body.rest_points, 0 * body.rest_points, stress, 1.0 + 1e-3 * stress)])
+    stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
+    values = attribute(stage, "/World/block/surface.primvars:vonMisesPoint", 0)
+    upper = read_animation(tmp_path / "run.usdc").scale.upper
+    assert values.max() > 1e5 and upper == 1.0
+    assert 0.0 < np.mean(values > upper) <= 0.005
+
+
 def test_a_given_color_range_is_kept(tmp_path: Path) -> None:
     body = make_body(2)
     frames = write(tmp_path / "run.usdc", [body], 2, color_range=(1e5, 2e5))
@@ -475,6 +489,57 @@ def test_a_partial_file_is_read_as_it_is_now(tmp_path: Path) -> None:
         for index, frame in enumerate(frames):
             points = held[-1].frame(index)[0].points
             assert np.array_equal(points, lifted(frame.points).astype(np.float32))
+
+
+def fail_to_move(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Lets no file be moved to a path of this name."""
+
+    def replace(source, target) -> None:
+        if Path(target).name == name:
+            raise OSError("no space left")
+        REPLACE(source, target)
+
+    monkeypatch.setattr("warpfem.usd.chunks.os.replace", replace)
+
+
+REPLACE = os.replace
+
+
+@pytest.mark.parametrize("name", ["000002.usdc", "run.partial.usda"])
+def test_frames_that_could_not_be_saved_are_saved_later(tmp_path: Path, monkeypatch, name: str) -> None:
+    body = make_body(2)
+    frames = [make_frame(body, index) for index in range(5)]
+    writer = UsdWriter(tmp_path / "run.usdc", [body], fps=24, frames_per_chunk=2)
+    for frame in frames[:3]:
+        writer.write_frame([frame])
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match=r"run\.usdc cannot be written: no space"):
+        fail_to_move(patch, name)
+        writer.write_frame([frames[3]])
+    assert (tmp_path / "run.partial" / "000002.usdc").exists() == (name != "000002.usdc")
+    assert_sound(tmp_path / "run.partial.usda", 2)
+    writer.write_frame([frames[4]])
+    writer.close()
+    assert_sound(tmp_path / "run.usdc", 5)
+    animation = read_animation(tmp_path / "run.usdc")
+    for index, frame in enumerate(frames):
+        assert np.array_equal(animation.frame(index)[0].points, lifted(frame.points).astype(np.float32))
+
+
+def test_a_failed_merge_keeps_the_old_output_the_frames_and_the_first_error(tmp_path: Path, monkeypatch) -> None:
+    path, body = tmp_path / "run.usdc", make_body(2)
+    write(path, [body], 2)
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="diverged") as caught:
+        fail_to_move(patch, path.name)
+        with UsdWriter(path, [body], fps=24) as writer:
+            writer.write_frame([make_frame(body, 0)])
+            raise RuntimeError("diverged")
+    (note,) = caught.value.__notes__
+    assert f"cannot be written (the frames are in {tmp_path / 'run.partial.usda'})" in note
+    assert_sound(path, 2)
+    assert_sound(tmp_path / "run.partial.usda", 1)
+    assert not (tmp_path / "run.partial" / "merged.usdc").exists()
+    writer.close()
+    assert_sound(path, 1)
 
 
 CHILD = """

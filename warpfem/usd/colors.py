@@ -83,4 +83,4 @@ class ColorScale:
 def spread_of(quantity: ColorQuantity, values: np.ndarray) -> float:
     """How far values go from rest, less the outermost 0.5 %: one singular corner is not the picture."""
     rest = 0.0 if quantity == "von_mises" else 1.0
-    return float(np.percentile(np.abs(values - rest), 99.5))
+    return float(np.percentile(np.abs(values - rest), 99.5, method="higher"))
