@@ -26,7 +26,7 @@ ROUTES = ("assembled", "closed", "tape")
 routes = pytest.mark.parametrize("route", ROUTES)
 dims = pytest.mark.parametrize("dim", [pytest.param(2, id="2D"), pytest.param(3, id="3D")])
 settings = pytest.mark.parametrize(
-    ("dim", "dtype"), [(2, "float64"), (3, "float64"), (3, "float32")], ids=lambda value: str(value)
+    ("dim", "dtype"), [(2, "float64"), (3, "float64"), (2, "float32")], ids=lambda value: str(value)
 )
 E, NU = 1e5, 0.35
 ALL = (LinearElasticity, StVenantKirchhoff, NeoHookean, FixedCorotated, StableNeoHookean)
@@ -82,16 +82,25 @@ def free_components(model: Model) -> np.ndarray:
 # ---- operators
 
 
-@dims
-def test_three_routes_agree(dim, rng):
+@pytest.mark.parametrize(
+    ("dim", "dtype", "materials"),
+    [
+        pytest.param(3, "float64", ALL, id="3D-float64"),
+        pytest.param(2, "float32", ALL, id="2D-float32"),
+        pytest.param(2, "float64", ALL, id="2D-float64", marks=pytest.mark.slow),
+        pytest.param(3, "float32", ALL, id="3D-float32", marks=pytest.mark.slow),
+        pytest.param(2, "float64", SOME, id="2D-float64-some"),
+    ],
+)
+def test_three_routes_agree(dim, dtype, materials, rng):
     """To rounding, for bodies of all materials with a written P together."""
-    model = bodies_of(dim, "float64", ALL)
+    model = bodies_of(dim, dtype, materials)
     state = shaken(model)
     p = rng.normal(size=model.rest_points.shape)
     assembled, closed, tape = (model.force_differential(state, p, route) for route in ROUTES)
-    size = np.abs(closed).max()
-    np.testing.assert_allclose(assembled, closed, atol=1e-13 * size)
-    np.testing.assert_allclose(tape, closed, atol=1e-13 * size)
+    rounding = 30.0 * model.types.epsilon * np.abs(closed).max()
+    np.testing.assert_allclose(assembled, closed, atol=rounding)
+    np.testing.assert_allclose(tape, closed, atol=rounding)
 
 
 @dims
@@ -109,16 +118,6 @@ def test_three_routes_agree_for_psi_alone(dim, rng):
     for route in ROUTES:
         actual = models[0].force_differential(shaken(models[0]), p, route)
         np.testing.assert_allclose(actual, expected, atol=1e-8 * np.abs(expected).max())
-
-
-@dims
-def test_three_routes_agree_in_single_precision(dim, rng):
-    model, exact = (bodies_of(dim, dtype, SOME) for dtype in ("float32", "float64"))
-    p = rng.normal(size=model.rest_points.shape)
-    expected = exact.force_differential(shaken(exact), p)
-    for route in ROUTES:
-        actual = model.force_differential(shaken(model), p, route)
-        np.testing.assert_allclose(actual, expected, atol=3e-6 * np.abs(expected).max())
 
 
 @routes

@@ -71,7 +71,7 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         log1p_out[i] = tensor.log1p(y[i])
         deficit_out[i] = tensor.log1p_deficit(y[i])
 
-    @wp.kernel(module=f"{module}_adjoint")
+    @wp.kernel(module=module)
     def differentiable_rotation(F: wp.array(dtype=matrix), R_out: wp.array(dtype=matrix)):
         i = wp.tid()
         R_out[i] = tensor.rotation(F[i])
