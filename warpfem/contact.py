@@ -1,12 +1,13 @@
 """Contact of boundary points with fixed obstacles: a penalty for depth, and Coulomb friction.
 
-A point at depth g below an obstacle's surface has the energy k A g^2 / 2, where A is the point's share of
-the rest surface and k the stiffness [Pa/m]; a pressure p therefore rests at the depth p / k. In implicit
-steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact, section 5): below
-``slip_speed`` it falls off quadratically, so that a point that ought to stick creeps, slower than
-``slip_speed``. Its limit and normal are those of the last Newton iterate, so that the converged step obeys
-mu times the normal force of the same step. A step of one linear solve makes it a drag. In explicit steps it
-is an impulse that stops the tangential motion, up to mu times the normal impulse.
+A point at depth g below an obstacle's surface has the energy k A g^2 / 2, where A is the area of the rest
+surface with which the point bears and k the stiffness [Pa/m]; a pressure p therefore rests at the depth p / k.
+
+In implicit steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact,
+section 5): below ``slip_speed`` it falls off quadratically, so that a point that ought to stick creeps, slower
+than ``slip_speed``. Its limit and normal are those of a Newton iterate near the last, so that the converged
+step obeys mu times the normal force of the same step. A step of one linear solve makes it a drag. In explicit
+steps it is an impulse that stops the tangential motion, up to mu times the normal impulse.
 """
 
 import functools
@@ -18,6 +19,7 @@ import warp as wp
 
 from warpfem.boundary import BoxWalls, Obstacle, Plane, Sphere
 from warpfem.dtypes import types
+from warpfem.mesh import Mesh
 from warpfem.scene import Body
 
 
@@ -278,6 +280,23 @@ class _ObstacleContact:
         wp.launch(getattr(self.kernels, name), self.count, inputs=inputs, outputs=outputs, device=self.device)
 
 
+def _bearing_areas(mesh: Mesh) -> np.ndarray:
+    """The area with which each boundary point bears on an obstacle, (k,) [m^2].
+
+    It is the largest that the point's share of its faces projects to along any of their normals: on a smooth
+    surface the share itself, on the rim of a flat base that of the base without the sides.
+    """
+    corners = mesh.boundary_faces.ravel()
+    order = np.argsort(corners, kind="stable")
+    _, starts, counts = np.unique(corners[order], return_index=True, return_counts=True)
+    columns = np.arange(counts.max())
+    faces = order[np.minimum(starts[:, None] + columns, len(order) - 1)] // mesh.dim
+    areas = np.where(columns < counts[:, None], mesh.boundary_face_areas[faces] / mesh.dim, 0.0)
+    normals = mesh.boundary_face_normals[faces]
+    cosines = np.einsum("kid,kjd->kij", normals, normals)
+    return np.einsum("kij,kj->ki", np.maximum(cosines, 0.0), areas).max(axis=1, where=areas > 0.0, initial=0.0)
+
+
 class ContactSurface:
     """The boundary points of all bodies with their rest places, areas and default stiffness."""
 
@@ -285,11 +304,9 @@ class ContactSurface:
         rest, points, areas, stiffness = [], [], [], []
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
             mesh = body.mesh
-            share = np.zeros(mesh.point_count)
-            np.add.at(share, mesh.boundary_faces, (mesh.boundary_face_areas / mesh.dim)[:, None])
             rest.append(mesh.points[mesh.boundary_points])
             points.append(start + mesh.boundary_points)
-            areas.append(share[mesh.boundary_points])
+            areas.append(_bearing_areas(mesh))
             stiffness.append(np.full(len(mesh.boundary_points), modulus / mesh.mean_edge_length))
         self.device = device
         self.rest = np.concatenate(rest)

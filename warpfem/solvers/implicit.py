@@ -299,8 +299,11 @@ class _BackwardEulerStepper(Stepper):
             sizes.append(model.dot(model.dead_load, model.dead_load))
             self._launch("add_scaled", [force, 1.0, model.dead_load], [force])
         if model.contact is not None:
-            model.contact.add_force(u, force)
-            model.contact.add_friction_force(self._start, self._dt, u, force)
+            part.zero_()
+            model.contact.add_force(u, part)
+            model.contact.add_friction_force(self._start, self._dt, u, part)
+            sizes.append(model.dot(part, part))
+            self._launch("add_scaled", [force, 1.0, part], [force])
         if model.supports is not None:
             model.supports.project(force)
         return float(np.sqrt(model.dot(force, force))), float(np.sqrt(max(sizes)))
@@ -336,7 +339,7 @@ class BackwardEuler(Solver):
 
     Attributes:
         tolerance: largest accepted norm of the unbalanced force, relative to the largest of inertia,
-            internal force and load; it does not depend on units, dt or mesh size.
+            internal force, load and contact; it does not depend on units, dt or mesh size.
         max_iterations: Newton iterations; 1 takes the linearised step.
         hessian: "clamped" makes each element's stiffness positive semi-definite by setting negative
             eigenvalues to zero (Teran et al. 2005); "exact" leaves it, and directions of negative curvature
@@ -378,7 +381,11 @@ class BackwardEuler(Solver):
 
     @classmethod
     def linearised(cls, differential: Route = "assembled", linear_tolerance: float = 1e-5) -> "BackwardEuler":
-        """One linear solve a step: (M + dt^2 K(u_t)) v = M v_t + dt f(u_t) (Hu 2020, eq. 11)."""
+        """One linear solve a step: (M + dt^2 K(u_t)) v = M v_t + dt f(u_t) (Hu 2020, eq. 11).
+
+        Friction is a drag fitted to the speed of the step's start: sliding points slow down by Coulomb's law
+        and sticking ones creep, but a point that comes loose takes many steps to.
+        """
         return cls(
             max_iterations=1,
             hessian="exact",
