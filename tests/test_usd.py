@@ -144,7 +144,7 @@ def test_a_file_is_sound(tmp_path: Path, dim: int, suffix: str) -> None:
         assert bool(tets) == (dim == 3)
         if tets:
             assert tets.GetPurposeAttr().Get() == "guide" and tets.GetOrientationAttr().Get() == "rightHanded"
-        surface = UsdGeom.Mesh.Get(stage, f"/World/{name}/surface")
+        surface = UsdGeom.Mesh.Get(stage, f"/World/{name}/{name}_surface")
         assert surface.GetSubdivisionSchemeAttr().Get() == "none"
         assert surface.GetDoubleSidedAttr().Get() == (dim == 2)
         assert surface.GetDisplayColorPrimvar().GetInterpolation() == "vertex"
@@ -161,7 +161,7 @@ def test_the_validators_are_awake(tmp_path: Path) -> None:
     write(tmp_path / "run.usdc", [make_body(3)], 1)
     stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
     stage.ClearMetadata("metersPerUnit")
-    UsdGeom.Mesh.Define(stage, "/World/block/surface/nested")
+    UsdGeom.Mesh.Define(stage, "/World/block/block_surface/nested")
     assert len(validation_errors(stage)) >= 2
 
 
@@ -171,9 +171,9 @@ def test_values_are_those_given_to_the_last_bit(tmp_path: Path, dim: int) -> Non
     frames = write(tmp_path / "run.usdc", [body], 5, frames_per_chunk=2)
     stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
     used = np.unique(body.surface_faces)
-    faces = attribute(stage, "/World/block/surface.faceVertexIndices").reshape(-1, 3)
+    faces = attribute(stage, "/World/block/block_surface.faceVertexIndices").reshape(-1, 3)
     assert np.array_equal(used[faces], body.surface_faces)
-    prims = {"surface": used} | ({"simulation": np.arange(len(body.rest_points))} if dim == 3 else {})
+    prims = {"block_surface": used} | ({"simulation": np.arange(len(body.rest_points))} if dim == 3 else {})
     for prim, points in prims.items():
         path = f"/World/block/{prim}"
         rest = lifted(body.rest_points)[points].astype(np.float32)
@@ -201,7 +201,7 @@ def test_a_second_reader_finds_the_same(tmp_path: Path, dim: int) -> None:
     keys = ("framesPerSecond", "timeCodesPerSecond", "startTimeCode", "endTimeCode", "metersPerUnit")
     assert [stage.get_metadata(key) for key in keys] == [25.0, 25.0, 0.0, 4.0, 1.0]
     assert stage.get_default_prim() == "World"
-    surface = stage.get_prim_at_path("/World/block/surface")
+    surface = stage.get_prim_at_path("/World/block/block_surface")
     used = np.unique(body.surface_faces)
     faces = np.asarray(surface.get_attribute("faceVertexIndices").value).reshape(-1, 3)
     assert np.array_equal(used[faces], body.surface_faces)
@@ -237,10 +237,10 @@ def test_primvars_are_averaged_by_volume_and_taken_from_the_owner(tmp_path: Path
         "J": [0.5, 0.5, 0.5, 2, 2, 2],
     }
     for name, values in expected.items():
-        assert attribute(stage, f"/World/pair/surface.primvars:{name}", 0) == pytest.approx(values)
+        assert attribute(stage, f"/World/pair/pair_surface.primvars:{name}", 0) == pytest.approx(values)
     assert attribute(stage, "/World/pair/simulation.primvars:vonMises", 0) == pytest.approx([3, 9])
-    assert not attribute(stage, "/World/pair/surface.primvars:vonMises").any()
-    assert (attribute(stage, "/World/pair/surface.primvars:J") == 1.0).all()
+    assert not attribute(stage, "/World/pair/pair_surface.primvars:vonMises").any()
+    assert (attribute(stage, "/World/pair/pair_surface.primvars:J") == 1.0).all()
 
 
 def test_normals_point_outwards_and_turn_with_the_body(tmp_path: Path) -> None:
@@ -251,9 +251,9 @@ def test_normals_point_outwards_and_turn_with_the_body(tmp_path: Path) -> None:
     with UsdWriter(tmp_path / "run.usdc", [body], fps=24) as writer:
         writer.write_frame([turned])
     stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
-    points, normals = (attribute(stage, f"/World/block/surface.{name}") for name in ("points", "normals"))
+    points, normals = (attribute(stage, f"/World/block/block_surface.{name}") for name in ("points", "normals"))
     assert (np.einsum("ij,ij->i", points - body.rest_points.mean(axis=0), normals) > 0.1).all()
-    assert attribute(stage, "/World/block/surface.normals", 0) == pytest.approx(normals @ turn.T, abs=1e-6)
+    assert attribute(stage, "/World/block/block_surface.normals", 0) == pytest.approx(normals @ turn.T, abs=1e-6)
 
 
 @pytest.mark.parametrize("dim", SETUPS)
@@ -344,7 +344,7 @@ def test_colors_have_one_range_for_the_whole_run(tmp_path: Path) -> None:
         assert values == pytest.approx(np.tile(scale.linear(level), (len(values), 1)), abs=1e-6)
 
 
-COLORS = "/World/block/surface.primvars:displayColor"
+COLORS = "/World/block/block_surface.primvars:displayColor"
 
 
 def test_colors_of_the_volume_ratio_are_symmetric_about_one(tmp_path: Path) -> None:
@@ -368,7 +368,7 @@ def test_one_singular_corner_does_not_set_the_color_range(tmp_path: Path) -> Non
     with UsdWriter(tmp_path / "run.usdc", [body], fps=24) as writer:
         writer.write_frame([BodyFrame(body.rest_points, 0 * body.rest_points, stress, 1.0 + 1e-3 * stress)])
     stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
-    values = attribute(stage, "/World/block/surface.primvars:vonMisesPoint", 0)
+    values = attribute(stage, "/World/block/block_surface.primvars:vonMisesPoint", 0)
     upper = read_animation(tmp_path / "run.usdc").scale.upper
     assert values.max() > 1e5 and 1.9 < upper < 2.0
     assert 0.004 < np.mean(values > upper) <= 0.005
@@ -381,7 +381,7 @@ def test_a_given_color_range_is_kept(tmp_path: Path) -> None:
     assert animation.scale == ColorScale("von_mises", 1e5, 2e5)
     assert frames[0][0].von_mises.max() > 2e5
     stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
-    values = attribute(stage, "/World/block/surface.primvars:vonMisesPoint", 1)
+    values = attribute(stage, "/World/block/block_surface.primvars:vonMisesPoint", 1)
     assert np.array_equal(attribute(stage, COLORS, 1), animation.scale.linear(values))
 
 

@@ -11,7 +11,7 @@ from pxr import Usd, UsdGeom
 from warpfem.errors import OutputError
 from warpfem.usd.colors import ColorScale
 from warpfem.usd.meshes import triangles_of
-from warpfem.usd.prims import CELL_PRIMVARS, OBSTACLES, POINT_PRIMVARS, SURFACE, TETS, WORLD
+from warpfem.usd.prims import CELL_PRIMVARS, OBSTACLES, POINT_PRIMVARS, TETS, WORLD, surface_name
 from warpfem.usd.stages import open_stage, reporting, world_matrix
 
 
@@ -75,7 +75,7 @@ class Animation:
         world = stage.GetPrimAtPath(WORLD)
         stated = world.GetCustomData().get("warpfem") if world else None
         children = world.GetChildren() if world else []
-        surfaces = [surface for child in children if (surface := child.GetChild(SURFACE))]
+        surfaces = [surface for child in children if (surface := child.GetChild(surface_name(child.GetName())))]
         if not stated or not surfaces:
             raise OutputError(f"{path} is not an animation that warpfem wrote")
         self.scale = ColorScale(stated["colorBy"], *stated["colorRange"])

@@ -21,7 +21,7 @@ from warpfem.usd.bodies import (
 from warpfem.usd.colors import ColorQuantity, ColorScale
 
 WORLD = Sdf.Path("/World")
-TETS, SURFACE, OBSTACLES = "simulation", "surface", "Obstacles"
+TETS, OBSTACLES = "simulation", "Obstacles"
 LOOKS = WORLD.AppendChild("Looks")
 POINT_PRIMVARS: dict[ColorQuantity, str] = {"von_mises": "vonMisesPoint", "jacobian": "JPoint"}
 CELL_PRIMVARS: dict[ColorQuantity, str] = {"von_mises": "vonMises", "jacobian": "J"}
@@ -98,11 +98,16 @@ def extent_of(points: np.ndarray) -> Vt.Vec3fArray:
     return Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))
 
 
+def surface_name(body: str) -> str:
+    """The name of a body's surface. Blender shows it alone, without the body's Xform."""
+    return f"{body}_surface"
+
+
 class BodyPrims:
     """The prims of one body: authored once at rest, then a source of samples, frame by frame.
 
     In 3D there is a ``TetMesh`` named ``simulation`` of purpose guide with every point, and beside it a
-    ``Mesh`` named ``surface`` with the points of the boundary only; in 2D there is just the ``surface``.
+    ``Mesh`` named after the body with the points of the boundary only; in 2D there is just that surface.
     """
 
     def __init__(self, stage: Usd.Stage, name: str, body: UsdBody) -> None:
@@ -128,7 +133,7 @@ class BodyPrims:
             root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*self._origin))
 
         self._tets = path.AppendChild(TETS) if body.cells.shape[1] == 4 else None
-        self._surface = path.AppendChild(SURFACE)
+        self._surface = path.AppendChild(surface_name(name))
         if self._tets:
             tets = UsdGeom.TetMesh.Define(stage, self._tets)
             tets.CreatePurposeAttr(UsdGeom.Tokens.guide)

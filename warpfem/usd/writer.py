@@ -33,7 +33,7 @@ class UsdWriter:
     stays as it is. **The next writer of the same ``path`` removes a partial file that a killed run left**:
     to keep it, choose another ``path`` or move file and folder elsewhere.
 
-    The file holds ``/World`` with an Xform per body. In it, ``surface`` is what viewers show; in 3D its
+    The file holds ``/World`` with an Xform per body. In it, ``NAME_surface`` is what viewers show; in 3D its
     sibling ``simulation`` is the tetrahedral mesh with all points. The rest shape is the default value,
     frame i the sample at time code i. Both have the primvars ``vonMises`` [Pa] and ``J`` per cell,
     ``vonMisesPoint`` and ``JPoint`` per point (averages weighted by rest volume). ``displayColor`` shows
