@@ -76,6 +76,12 @@ def test_quiet_prints_nothing(tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
 
 
+def test_quiet_prints_nothing_in_a_process_of_its_own(tmp_path):
+    command = [sys.executable, "-m", "warpfem", "run", BARS, "--out", str(tmp_path / "a.usdc"), "--frames", "0"]
+    result = subprocess.run([*command, "--quiet"], capture_output=True, text=True, check=True)
+    assert (result.stdout, result.stderr) == ("", "")
+
+
 def test_default_output_is_named_after_the_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["run", BARS, "--frames", "0", "--quiet"]) == OK

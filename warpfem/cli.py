@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import json
+import os
 import platform
 import sys
 import time
@@ -109,16 +110,25 @@ def _load(arguments: argparse.Namespace) -> Scene:
     return replace(scene, **{name: value for name, value in given.items() if value is not None})
 
 
-def _quiet_warp() -> None:
-    """Keeps Warp from reporting each module it loads, and that there is no CUDA driver."""
+def _start_warp() -> None:
+    """Starts Warp without its reports of loaded modules, and without its warning that there is no CUDA driver."""
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
+    sys.stderr.flush()
+    kept = os.dup(2)  # the warning comes from native code
+    try:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+            warp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _run(arguments: argparse.Namespace) -> int:
     """Runs a scene file and stores the animation in a USD file, frame by frame."""
-    _quiet_warp()
+    _start_warp()
     scene = _load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
     say = not (arguments.quiet or arguments.json)
@@ -206,7 +216,7 @@ def _explain(arguments: argparse.Namespace) -> int:
     """Says what a scene requires, and so what is modelled, compiled, stored and paid for in a step."""
     from warpfem.explain import explain
 
-    _quiet_warp()
+    _start_warp()
     print(explain(Simulation(_load(arguments), device=arguments.device, dtype=arguments.dtype)))
     return OK
 
@@ -223,8 +233,7 @@ def _info(arguments: argparse.Namespace) -> int:
     """Prints versions and devices."""
     import warp
 
-    _quiet_warp()
-    warp.init()
+    _start_warp()
     print(f"warpfem {warpfem.__version__}, Python {platform.python_version()}, {platform.platform()}")
     for package in ("warp-lang", "numpy", "usd-core"):
         print(f"{package} {importlib.metadata.version(package)}")
