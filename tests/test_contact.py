@@ -157,15 +157,13 @@ def test_a_point_at_the_centre_of_a_sphere_is_pushed_out():
 
 def test_planes_far_from_their_point_keep_their_digits():
     # only the height over the plane counts, also in float32 and 10 km along it
-    normal = np.array([0.6, 0.8])
-    point = 1e4 * np.array([0.8, -0.6])
-    model, _, _ = ready(
-        Scene([brick(2)], SymplecticEuler(), obstacles=[Plane(tuple(point), tuple(normal), stiffness=1e4)]), "float32"
-    )
-    state = model.state()
-    state.assign(displacement=np.tile([0.0, -1.0], (model.point_count, 1)))
+    normal = np.array([0.6, 0.8, 0.0])
+    point = 1e4 * np.array([0.8, -0.6, 0.0])
+    floor = Plane(tuple(point), tuple(normal), stiffness=1e4)
+    model, state, _ = ready(Scene([brick(3)], SymplecticEuler(), obstacles=[floor]), "float32")
+    state.assign(displacement=np.tile([0.0, -1.0, 0.0], (model.point_count, 1)))
     surface = model.contact.surface
-    gap = (surface.rest - point + [0.0, -1.0]) @ normal
+    gap = (surface.rest - point + [0.0, -1.0, 0.0]) @ normal
     expected = np.outer(surface.areas * 1e4 * np.maximum(-gap, 0.0), normal)
     np.testing.assert_allclose(contact_force(model, state)[surface.host_points], expected, rtol=1e-5, atol=1e-4)
 
@@ -304,8 +302,8 @@ def test_holds_below_the_angle_of_friction(solver, dim):
     else:
         # the smoothed law carries 95 % of its limit at 1 - sqrt(0.05) = 0.78 of the slip speed
         assert 0.4 < distance / (slip_speed * seconds) < 1.0
-    twice, _, _ = slide(solver, dim, 0.4, 0.95 * 0.4, 2.0 * seconds)
     if solver in EXPLICIT:
+        twice, _, _ = slide(solver, dim, 0.4, 0.95 * 0.4, 2.0 * seconds)
         assert abs(twice - distance) < 1e-4
 
 
@@ -355,6 +353,23 @@ def test_an_oblique_impact_takes_mu_times_the_normal_impulse(solver, dim):
     # implicit: the limits follow Newton's iterates, to its tolerance
     tolerance = 1e-10 if dim == 2 and solver in EXPLICIT else 2e-3
     assert -change @ along == pytest.approx(mu * change[1], rel=tolerance)
+
+
+def test_implicit_friction_has_the_normal_force_of_its_own_step():
+    # steps as long as the impact: a limit from the step before would miss the first of them
+    mu = 0.3
+    body = brick(2, velocity=(30.0, -1.0))
+    floor = plane(2, friction=mu)
+    model, state, stepper = ready(Scene([body], BackwardEuler(tolerance=1e-8), obstacles=[floor]))
+    changes = []
+    before = mean(model, state.velocity)
+    for _ in range(3):
+        advance(stepper, state, 5e-3, 1)
+        after = mean(model, state.velocity)
+        changes.append(after - before)
+        before = after
+    assert min(change[1] for change in changes) > 0.1
+    np.testing.assert_allclose([-change[0] / change[1] for change in changes], mu, rtol=1e-3)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -441,7 +456,9 @@ def test_slip_speed_follows_the_scene():
 
 @pytest.mark.parametrize("mesh", [Mesh.rectangle((3.0, 2.0), (3, 2)), Mesh.box((2.0, 1.0, 1.0), (4, 2, 2))])
 def test_points_bear_with_the_area_of_the_side_that_is_flat(mesh):
-    model = Model(Scene([Body("b", mesh, MATERIALS[mesh.dim])], SymplecticEuler(), obstacles=[plane(mesh.dim)]))
+    model = Model(
+        Scene([Body("b", mesh, MATERIALS[mesh.dim])], SymplecticEuler(), obstacles=[plane(mesh.dim)]), dtype="float64"
+    )
     surface = model.contact.surface
     area = np.zeros(mesh.point_count)
     area[surface.host_points] = surface.areas
@@ -456,7 +473,7 @@ def test_a_smooth_surface_bears_with_all_of_it():
     points = np.vstack([[0.0, 0.0], np.stack([np.cos(angles), np.sin(angles)], axis=1)])
     i = np.arange(200)
     disc = Mesh(points, np.stack([np.zeros(200, int), 1 + i, 1 + (i + 1) % 200], axis=1))
-    model = Model(Scene([Body("disc", disc, MATERIALS[2])], SymplecticEuler(), obstacles=[plane(2)]), device="cpu")
+    model = Model(Scene([Body("disc", disc, MATERIALS[2])], SymplecticEuler(), obstacles=[plane(2)]), dtype="float64")
     np.testing.assert_allclose(model.contact.surface.areas, 2.0 * np.pi / 200, rtol=1e-3)
 
 

@@ -115,7 +115,7 @@ def test_supports_of_a_second_body_hold_its_own_points():
 
 def test_pins_may_overlap():
     body = slab(2, supports=[Pin("left"), Pin("bottom", axes=(1,)), Pin("left", axes=(0,))])
-    model = Model(Scene([body], SymplecticEuler()), device="cpu")
+    model = Model(Scene([body], SymplecticEuler()), dtype="float64")
     mesh = body.mesh
     held = np.union1d(mesh.select_points("left"), mesh.select_points("bottom"))
     np.testing.assert_array_equal(model.supports.host_points, held)
@@ -157,7 +157,7 @@ def test_a_motion_that_is_not_finite_names_the_meshs_point():
     body = slab(2, supports=[PrescribedMotion("right", motion)])
     point = body.mesh.select_points("right")[1]
     with pytest.raises(SceneError, match=rf"t = 0 s for point {point} \(1 in all\)"):
-        Model(Scene([body], SymplecticEuler()), device="cpu").state()
+        Model(Scene([body], SymplecticEuler()), dtype="float64").state()
 
 
 def still(rest, time):
@@ -185,12 +185,12 @@ def still(rest, time):
 )
 def test_refuses_supports(supports, message):
     with pytest.raises(SceneError, match=message):
-        Model(Scene([slab(2, supports=supports)], SymplecticEuler()), device="cpu")
+        Model(Scene([slab(2, supports=supports)], SymplecticEuler()), dtype="float64")
 
 
 def test_a_pin_and_a_motion_of_other_components_go_together():
     supports = [Pin("left", axes=(0,)), PrescribedMotion("left", still, axes=(1,))]
-    assert Model(Scene([slab(2, supports=supports)], SymplecticEuler()), device="cpu").supports.count == 3
+    assert Model(Scene([slab(2, supports=supports)], SymplecticEuler()), dtype="float64").supports.count == 3
 
 
 def test_refuses_a_motion_that_is_not_a_function():
