@@ -233,8 +233,8 @@ class _BackwardEulerStepper(Stepper):
         """Backtracks from the full step until the potential falls enough (Armijo); None if it never does.
 
         Near the minimum the fall drowns in the rounding of the potential: about the work of the forces, of
-        norm ``scale``, over one rounding of u. There a full step will do that halves the slope, which rounding
-        spares (after Hager and Zhang 2005).
+        norm ``scale``, over one rounding of u. There the slope decides, which rounding spares (after Hager and
+        Zhang 2005): a step will do that still descends at its end, or a full one that overshoots by half.
         """
         model = self.model
         slope = -model.dot(self._force, self._direction)
@@ -244,9 +244,9 @@ class _BackwardEulerStepper(Stepper):
             self._launch("add_scaled", [self._u, length, self._direction], [self._trial])
             value = self._potential(self._trial)
             fell = value <= potential + 1e-4 * length * slope
-            if not fell and length == 1.0 and value <= potential + noise:
+            if not fell and value <= potential + noise:
                 self._unbalanced_force(self._trial)
-                fell = abs(model.dot(self._force, self._direction)) <= 0.5 * abs(slope)
+                fell = -model.dot(self._force, self._direction) <= (-0.5 * slope if length == 1.0 else 0.0)
             if fell:
                 self._u, self._trial = self._trial, self._u
                 return value
