@@ -239,8 +239,9 @@ def test_energy_of_many_cells_keeps_its_digits():
 
 def test_dot_sums_in_double_precision():
     model = model_of(SOFT, square(40), "float32")
-    a = wp.full(model.point_count, wp.vec2f(1.0, 1e-5), dtype=wp.vec2f)
-    assert model.dot(a, a) == pytest.approx(model.point_count * (1.0 + 1e-10), rel=1e-12)
+    a = wp.full(model.point_count, wp.vec2f(0.1, 1e-3), dtype=wp.vec2f)
+    exact = np.float64(np.float32(0.1)) ** 2 + np.float64(np.float32(1e-3)) ** 2
+    assert model.dot(a, a) == pytest.approx(model.point_count * exact, rel=1e-12)
 
 
 # ---- initial state and State
