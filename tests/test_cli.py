@@ -124,7 +124,11 @@ def test_wrong_use_is_one_message_and_no_file(tmp_path, monkeypatch, capsys, arg
         ("x = 1\n", "does not define a function scene"),
         ("def scene():\n    return 3\n", "must return a warpfem.Scene, not int"),
         ("def scene():\n    return wf.Scene([], wf.BackwardEuler())\n", "at least one warpfem.Body"),
-        ("def scene():\n\n    return 1 / 0\n", "line 4: ZeroDivisionError"),
+        ("def scene():\n    return wf.NeoHookean(e=1, nu=0.3)\n", "line 3"),
+        ("def scene():\n    return wf.NeoHookean(E=1, nu=0.5)\n", "line 3"),
+        ("def scene(cells):\n    return cells\n", "give it with --set cells=VALUE"),
+        ("raise SystemExit(3)\n", "line 2"),
+        ("def scene():\n\n    return 1 / 0\n", "ZeroDivisionError: division by zero"),
     ],
 )
 def test_errors_in_a_scene_file_name_file_and_line(scene_file, capsys, body, message):
@@ -157,9 +161,45 @@ def test_a_failed_run_keeps_its_frames(tmp_path, scene_file, capsys):
     assert read_animation(out).frame_count == 3
 
 
+LATE = """
+def scene():
+    def motion(rest, time):
+        return rest if time < 0.3 else undefined_name
+    mesh = wf.Mesh.box((1, 1, 1), (1, 1, 1))
+    body = wf.Body("cube", mesh, wf.StableNeoHookean(E=1e5, nu=0.3), supports=[wf.PrescribedMotion("top", motion)])
+    return wf.Scene([body], wf.BackwardEuler(), fps=10, frames=10)
+"""
+
+
+def test_an_error_in_a_prescribed_motion_names_body_time_and_line(tmp_path, scene_file, capsys):
+    out = tmp_path / "cube.usdc"
+    path = scene_file(LATE)
+    assert main(["run", path, "--out", str(out), "--quiet"]) == FAILED
+    printed = capsys.readouterr().err
+    assert "body 'cube', prescribed motion at t = 0.3 s: NameError: name 'undefined_name'" in printed
+    assert f"({path}, line 5)" in printed
+    assert f"3 frames are in {out}" in printed
+    assert read_animation(out).frame_count == 3
+
+
+def test_what_can_be_checked_is_checked_before_preparing(tmp_path, capsys):
+    assert main(["run", BARS, "--out", str(tmp_path / "a.txt")]) == WRONG_USE
+    assert "preparing" not in capsys.readouterr().err
+
+
+def test_a_body_that_starts_inside_an_obstacle_is_pointed_out(tmp_path, scene_file, capsys):
+    body = """
+def scene():
+    body = wf.Body("cube", wf.Mesh.box((1, 1, 1), (1, 1, 1)), wf.StableNeoHookean(E=1e5, nu=0.3))
+    return wf.Scene([body], wf.BackwardEuler(), frames=1, obstacles=[wf.Plane((0, 0.25, 0), (0, 1, 0))])
+"""
+    assert main(["run", scene_file(body), "--out", str(tmp_path / "a.usdc")]) == OK
+    assert "(0.25 m at the start)" in capsys.readouterr().out
+
+
 def test_a_dt_above_the_limit_is_refused_before_anything_is_written(tmp_path, capsys):
     out = tmp_path / "bar.usdc"
-    assert main(["run", str(SCENES / "stretch.py"), "--set", "dt=0.5", "--out", str(out)]) == FAILED
+    assert main(["run", str(SCENES / "stretch.py"), "--set", "dt=0.5", "--out", str(out)]) == WRONG_USE
     assert "above the stability limit" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 

@@ -429,7 +429,7 @@ def test_a_bounce_restores_the_height(dim):
         (lambda: BoxWalls((0.0, 0.0), (1.0, 0.0)), "must be below upper"),
         (
             lambda: Scene([brick(2)], SymplecticEuler(), obstacles=[plane(3)]),
-            "Plane must be a finite vector of length 2",
+            "Plane: its place must be a finite vector of length 2",
         ),
         (lambda: Scene([brick(2)], SymplecticEuler(), obstacles=["floor"]), "must be a Plane, Sphere or BoxWalls"),
     ],

@@ -150,6 +150,37 @@ def test_device_bytes_count_a_uniform_array_once():
     assert device_bytes([model.mass]) == 8 * 4
 
 
+def test_a_body_without_volume_is_no_failure_for_a_material_that_bears_inversion():
+    flat = cube(displacement=lambda x: -x * (0, 1, 0), dt=1e-3, fps=20, frames=4)
+    frames = list(wf.Simulation(flat).frames())
+    assert frames[0].jacobian == pytest.approx(0.0)
+    assert np.isfinite(frames[0].von_mises).all()
+
+
+def test_functions_of_the_user_get_copies_and_their_errors_are_named():
+    def shove(points):
+        points[:, 0] += 1.0
+        return points
+
+    scene = cube(displacement=shove)
+    np.testing.assert_array_equal(scene.bodies[0].initial_displacement()[:, 0], scene.bodies[0].mesh.points[:, 0] + 1.0)
+    with pytest.raises(wf.SceneError, match=r"body 'cube', initial displacement: ZeroDivisionError: .*line \d+"):
+        wf.Model(cube(displacement=lambda points: 1 / 0)).state()
+
+
+def test_only_a_scene_makes_a_model():
+    with pytest.raises(wf.SceneError, match=r"a model is made of a warpfem.Scene, not of \[1\]"):
+        wf.Simulation([1])
+
+
+@pytest.mark.parametrize(
+    ("material", "nu"), [(wf.NeoHookean, -0.1), (wf.FixedCorotated, -0.1), (wf.StableNeoHookean, -0.9)]
+)
+def test_poissons_ratios_whose_energy_is_not_least_at_rest_are_pointed_out(material, nu):
+    with pytest.warns(UserWarning, match=f"{material.__name__}: for nu < "):
+        material(E=1.0, nu=nu)
+
+
 def test_run_returns_the_summary_and_writes_the_file(tmp_path):
     out = tmp_path / "cube.usdc"
     summary = wf.run(cube(frames=2, gravity=(0, -10, 0)), out, device="cpu")

@@ -7,9 +7,11 @@ import importlib.metadata
 import json
 import os
 import platform
+import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -35,16 +37,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         return arguments.command(arguments)
-    except SimulationError as error:
-        return _fail(error, FAILED)
-    except WarpfemError as error:
+    except WarpfemError as error:  # before the first frame of a run: nothing has been written
         return _fail(error, WRONG_USE)
+    except KeyboardInterrupt:
+        return _fail(SimulationError("interrupted before anything was written"), FAILED)
 
 
 def _fail(error: Exception, code: int) -> int:
     print(f"warpfem: {error}", file=sys.stderr)
     for note in getattr(error, "__notes__", ()):
-        print(f"warpfem: {note}", file=sys.stderr)
+        print(f"  {note}", file=sys.stderr)
     return code
 
 
@@ -126,11 +128,27 @@ def _start_warp() -> None:
         os.close(kept)
 
 
+@contextmanager
+def _delayed_interrupt() -> Iterator[None]:
+    """Holds back Ctrl-C: the import of the USD libraries swallows it."""
+    seen = []
+    before = signal.signal(signal.SIGINT, lambda *_: seen.append(True))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if seen:
+        raise KeyboardInterrupt
+
+
 def _run(arguments: argparse.Namespace) -> int:
     """Runs a scene file and stores the animation in a USD file, frame by frame."""
     _start_warp()
     scene = _load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
+    with _delayed_interrupt():
+        from warpfem.usd import check_path
+    check_path(out)
     say = not (arguments.quiet or arguments.json)
     if say:
         print(f"{arguments.scene}: preparing (the first run of a scene compiles its kernels)", file=sys.stderr)
@@ -142,17 +160,23 @@ def _run(arguments: argparse.Namespace) -> int:
         for _ in _progress(frames, scene.frames + 1) if say else frames:
             pass
     except KeyboardInterrupt:
-        code = _fail(SimulationError(f"interrupted: {summary.frames} frames are in {out}"), FAILED)
+        code = _fail(SimulationError(f"interrupted: {_kept(summary, out)}"), FAILED)
     except WarpfemError as error:
         if not summary.frames:
             raise
-        error.add_note(f"{summary.frames} frames are in {out}")
+        error.add_note(_kept(summary, out))
         code = _fail(error, FAILED)
     if arguments.json:
         print(json.dumps(_summary_data(summary, arguments, out), indent=2))
     elif not arguments.quiet:
-        print(_summary_text(summary, simulation, out))
+        print(_summary_text(summary, simulation))
+        if code == OK:
+            print(f"wrote {out}")
     return code
+
+
+def _kept(summary: Summary, out: Path) -> str:
+    return f"{summary.frames} frame{' is' if summary.frames == 1 else 's are'} in {out}"
 
 
 def _progress(frames: Iterable[Frame], total: int) -> Iterator[Frame]:
@@ -178,7 +202,7 @@ def _summary_data(summary: Summary, arguments: argparse.Namespace, out: Path) ->
     return {name: None if value == float("inf") else value for name, value in data.items()}
 
 
-def _summary_text(summary: Summary, simulation: Simulation, out: Path) -> str:
+def _summary_text(summary: Summary, simulation: Simulation) -> str:
     lines = [
         f"{summary.frames} frames, {summary.steps} steps of {summary.dt:.4g} s, "
         f"{summary.simulated_seconds:.3f} s simulated",
@@ -197,7 +221,8 @@ def _summary_text(summary: Summary, simulation: Simulation, out: Path) -> str:
         f"largest von Mises stress {summary.largest_von_mises:.4g} Pa, smallest J {summary.smallest_jacobian:.4g}"
     )
     if simulation.model.contact is not None:
-        lines.append(f"deepest penetration {summary.largest_penetration:.3g} m")
+        start = f" ({summary.first_penetration:.3g} m at the start)" if summary.first_penetration > 0.0 else ""
+        lines.append(f"deepest penetration of an obstacle {summary.largest_penetration:.3g} m{start}")
     if summary.newton_iterations:
         lines.append(
             f"{summary.newton_iterations} Newton and {summary.cg_iterations} conjugate gradient iterations "
@@ -208,7 +233,6 @@ def _summary_text(summary: Summary, simulation: Simulation, out: Path) -> str:
             f"NOT CONVERGED in {summary.unconverged_steps} of {summary.steps} steps: worst residual "
             f"{summary.worst_residual:.2e}, {summary.worst_note}"
         )
-    lines.append(f"wrote {out}")
     return "\n".join(lines)
 
 

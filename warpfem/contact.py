@@ -80,7 +80,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         normal_out[k] = normal
 
     @wp.kernel(module=module, enable_backward=False)
-    def energy(
+    def contact_energy(
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
         stiffness: wp.array(dtype=scalar),
@@ -96,7 +96,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * stiffness[k] * gap * gap))
 
     @wp.kernel(module=module, enable_backward=False)
-    def force(
+    def contact_force(
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
         stiffness: wp.array(dtype=scalar),
@@ -113,7 +113,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             force_out[i] += (-stiffness[k] * gap) * normal
 
     @wp.kernel(module=module, enable_backward=False)
-    def stiffness_blocks(
+    def contact_blocks(
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
         stiffness: wp.array(dtype=scalar),
@@ -233,9 +233,9 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
 
     return SimpleNamespace(
         friction_limit=friction_limit,
-        energy=energy,
-        force=force,
-        stiffness_blocks=stiffness_blocks,
+        contact_energy=contact_energy,
+        contact_force=contact_force,
+        contact_blocks=contact_blocks,
         friction_energy=friction_energy,
         friction_force=friction_force,
         friction_blocks=friction_blocks,
@@ -365,17 +365,17 @@ class Contact:
     def add_energy(self, u: wp.array, energy_out: wp.array) -> None:
         """Adds the penalty energy to ``energy_out[0]``."""
         for part in self.parts:
-            part.launch("energy", [*part.normal_arguments, u], [energy_out])
+            part.launch("contact_energy", [*part.normal_arguments, u], [energy_out])
 
     def add_force(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the normal forces."""
         for part in self.parts:
-            part.launch("force", [*part.normal_arguments, u], [force_out])
+            part.launch("contact_force", [*part.normal_arguments, u], [force_out])
 
     def add_blocks(self, u: wp.array, blocks_out: wp.array) -> None:
         """Adds each point's normal stiffness to its d x d block."""
         for part in self.parts:
-            part.launch("stiffness_blocks", [*part.normal_arguments, u], [blocks_out])
+            part.launch("contact_blocks", [*part.normal_arguments, u], [blocks_out])
 
     # Friction of one step: its limits are those at one u, then come the potential's terms at any trial u.
 

@@ -287,7 +287,7 @@ class ElementKernels:
 
     @functools.cached_property
     def diagnostics(self) -> wp.Kernel:
-        """Writes J and the von Mises stress sqrt(3/2) |dev sigma| of each cell."""
+        """Writes J and the von Mises stress sqrt(3/2) |dev tau| / |J| of each cell, with |J| at least 1e-6."""
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         displacement_gradient = self._displacement_gradient
@@ -308,7 +308,7 @@ class ElementKernels:
             kirchhoff = stress(H, parameters[i]) * wp.transpose(deformation_gradient(H))
             deviator = kirchhoff - (wp.trace(kirchhoff) / scalar(3.0)) * identity_like(H)
             jacobian_out[i] = J
-            von_mises_out[i] = wp.sqrt(scalar(1.5) * wp.ddot(deviator, deviator)) / wp.abs(J)
+            von_mises_out[i] = wp.sqrt(scalar(1.5) * wp.ddot(deviator, deviator)) / wp.max(wp.abs(J), scalar(1.0e-6))
 
         return element_diagnostics
 

@@ -1,5 +1,10 @@
 """The exceptions of warpfem. Each message says what is wrong, where, and what to try."""
 
+import os
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class WarpfemError(Exception):
     """Base of every error that warpfem raises on purpose."""
@@ -32,3 +37,31 @@ class MissingExtraError(WarpfemError, ImportError):
 
 class SimulationError(WarpfemError, RuntimeError):
     """A run that cannot go on: it diverged, or a step could not be solved."""
+
+
+@contextmanager
+def user_code(where: str, file: str) -> Iterator[None]:
+    """Turns what a user's code raises into a SceneError that names the last line of ``file`` that was reached.
+
+    A :class:`WarpfemError` stays what it is, with the line added as a note.
+    """
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        reached = [f for f in traceback.extract_tb(error.__traceback__) if _same_file(f.filename, file)]
+        line = f"{file}, line {reached[-1].lineno}" if reached else file
+        if isinstance(error, WarpfemError):
+            if reached:
+                error.add_note(f"in {line}")
+            raise
+        raise SceneError(f"{where}: {type(error).__name__}: {error} ({line})") from error
+
+
+def source_of(function: object) -> str:
+    """The file that a function was written in, or "" if there is none."""
+    code = getattr(function, "__code__", None)
+    return "" if code is None else code.co_filename
+
+
+def _same_file(a: str, b: str) -> bool:
+    return os.path.abspath(a) == os.path.abspath(b)

@@ -132,7 +132,8 @@ def _terms(simulation: Simulation) -> list[Term]:
         Term(
             "contact",
             model.contact is not None,
-            ", ".join(f"{count} {kind}" for kind, count in kinds.items()) or "the scene has no obstacles",
+            ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+            or "the scene has no obstacles (bodies do not touch each other)",
         ),
         Term(
             "friction",

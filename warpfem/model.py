@@ -210,6 +210,8 @@ class Model:
     """
 
     def __init__(self, scene: Scene, *, device: str | None = None, dtype: FloatName = "float32") -> None:
+        if not isinstance(scene, Scene):
+            raise SceneError(f"a model is made of a warpfem.Scene, not of {scene!r}")
         self.scene = scene
         self.dtype = dtype
         self.dim = scene.dim
@@ -217,7 +219,8 @@ class Model:
         try:
             self.device = wp.get_device(device)
         except (RuntimeError, ValueError) as error:
-            raise SceneError(f"no device '{device}': {error}") from None
+            known = ", ".join(str(known.alias) for known in wp.get_devices())
+            raise SceneError(f"no device '{device}': there is {known}") from error
         meshes = [body.mesh for body in scene.bodies]
         self.point_starts = np.concatenate([[0], np.cumsum([mesh.point_count for mesh in meshes])])
         self.cell_starts = np.concatenate([[0], np.cumsum([mesh.cell_count for mesh in meshes])])
@@ -352,7 +355,7 @@ class Model:
             device=self.device,
         )
         kinetic = float(self._sum.numpy()[0])
-        load = 0.0 if self.dead_load is None else -self.dot(self.dead_load, state.u)
+        load = 0.0 if self.dead_load is None else 0.0 - self.dot(self.dead_load, state.u)
         return Energies(kinetic, self.elastic_energy(state.u), load, self.contact_energy(state.u))
 
     def add_internal_force(self, u: wp.array, force_out: wp.array) -> None:

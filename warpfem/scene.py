@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from warpfem.boundary import Load, Obstacle, Support, Vector
-from warpfem.errors import SceneError
+from warpfem.errors import SceneError, source_of, user_code
 from warpfem.materials import Material
 from warpfem.mesh import Mesh
 
@@ -37,8 +37,9 @@ class Body:
             1 m thick.
         supports: pins and prescribed motions.
         loads: point forces and tractions.
-        displacement: initial displacement [m]; ``None`` starts at rest shape.
-        velocity: initial velocity [m/s]; ``None`` starts at rest.
+        displacement: initial displacement [m]: one vector for all points, an array (point_count, dim), or a
+            function of the rest points (point_count, dim) that returns either; ``None`` starts at rest shape.
+        velocity: initial velocity [m/s], likewise; ``None`` starts at rest.
     """
 
     name: str
@@ -93,7 +94,9 @@ class Body:
         shape = self.mesh.points.shape
         if value is None:
             return np.zeros(shape)
-        value = value(self.mesh.points) if callable(value) else value
+        if callable(value):
+            with user_code(f"body '{self.name}', initial {name}", source_of(value)):
+                value = value(self.mesh.points.copy())
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
@@ -114,11 +117,14 @@ class Body:
 class Scene:
     """Everything that a simulation needs to know.
 
+    Bodies touch obstacles only: they pass through each other and through themselves.
+
     Attributes:
         bodies: at least one; all of the same dimension.
         solver: how time is stepped, for example ``BackwardEuler()``.
         dt: time step [s]; it is shortened to divide the frame interval. ``"auto"`` takes a safe part of the
-            stability limit for explicit solvers and the frame interval for implicit ones.
+            stability limit for explicit solvers and the frame interval for implicit ones, which damps motion
+            that is not much slower.
         gravity: acceleration [m/s^2]; ``None`` for none.
         obstacles: planes, spheres and box walls.
         damping: mass-proportional damping alpha [1/s], >= 0: the force -alpha m v.
@@ -146,7 +152,8 @@ class Scene:
             raise SceneError("a scene needs a list of at least one warpfem.Body")
         dims = {body.mesh.dim for body in self.bodies}
         if len(dims) != 1:
-            raise SceneError("all bodies of a scene must be 2D, or all 3D")
+            listed = ", ".join(f"'{body.name}' is {body.mesh.dim}D" for body in self.bodies)
+            raise SceneError(f"all bodies of a scene must be 2D, or all 3D: {listed}")
         object.__setattr__(self, "dim", dims.pop())
         names = [body.name for body in self.bodies]
         for name in names:
@@ -171,7 +178,7 @@ class Scene:
             if not isinstance(obstacle, Obstacle):
                 raise SceneError(f"an obstacle must be a Plane, Sphere or BoxWalls, not {obstacle!r}")
             vector = getattr(obstacle, "point", getattr(obstacle, "center", getattr(obstacle, "lower", ())))
-            self._check_vector(type(obstacle).__name__, vector)
+            self._check_vector(f"{type(obstacle).__name__}: its place", vector)
 
     def _check_number(self, name: str, value: object, positive: bool = False) -> None:
         number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)

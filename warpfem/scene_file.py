@@ -7,12 +7,11 @@ import difflib
 import importlib.util
 import inspect
 import sys
-import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from warpfem.errors import SceneError, WarpfemError
+from warpfem.errors import SceneError, user_code
 from warpfem.scene import Scene
 
 
@@ -61,16 +60,11 @@ def _scene_function(path: Path) -> Callable[..., Any]:
 
 def _call(path: Path, action: Callable[[], Any]) -> Any:
     """Turns an error in the file into one that names its line."""
-    try:
-        return action()
-    except WarpfemError:
-        raise
-    except SyntaxError as error:
-        raise SceneError(f"{path}, line {error.lineno}: {error.msg}") from error
-    except Exception as error:
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        where = f"{path}, line {frames[-1].lineno}" if frames else str(path)
-        raise SceneError(f"{where}: {type(error).__name__}: {error}") from error
+    with user_code(str(path), str(path)):
+        try:
+            return action()
+        except SyntaxError as error:
+            raise SceneError(f"{path}, line {error.lineno}: {error.msg}") from error
 
 
 def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:
@@ -79,10 +73,13 @@ def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, 
     for name, text in settings.items():
         if name not in parameters:
             close = difflib.get_close_matches(name, parameters, 1)
-            hint = f"; did you mean '{close[0]}'?" if close else ""
+            hint = f"; did you mean '{close[0]}'?" if close else "."
             known = ", ".join(str(p) for p in parameters.values()) or "none"
             raise SceneError(f"{path}: scene() has no parameter '{name}'{hint} It has: {known}")
         arguments[name] = _value(path, name, text, parameters[name].default)
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty and name not in arguments:
+            raise SceneError(f"{path}: parameter '{name}' has no default: give it with --set {name}=VALUE")
     return arguments
 
 
@@ -93,8 +90,11 @@ def _value(path: Path, name: str, text: str, default: Any) -> Any:
         value = ast.literal_eval(text)
     except (ValueError, SyntaxError):
         value = text
-    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+    if isinstance(default, float) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except (TypeError, ValueError):
+            pass  # reported below
     if default is not inspect.Parameter.empty and default is not None and type(value) is not type(default):
         raise SceneError(f"{path}: {name} must be of type {type(default).__name__}, like {default!r}, not {text!r}")
     return value

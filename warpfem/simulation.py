@@ -30,7 +30,7 @@ class Frame:
         displacement: (point_count, dim) float64 [m].
         velocity: (point_count, dim) float64 [m/s].
         jacobian: J = det F of each cell.
-        von_mises: von Mises stress of each cell [Pa].
+        von_mises: von Mises stress of each cell [Pa], that of |J| = 1e-6 where |J| is less.
         energies: the energies [J].
         penetration: greatest depth inside an obstacle [m].
     """
@@ -59,6 +59,7 @@ class Summary:
         first_energies, last_energies: energies of the first and the last frame [J].
         largest_von_mises: over all frames [Pa].
         smallest_jacobian: over all frames.
+        first_penetration: depth inside an obstacle in the first frame [m].
         largest_penetration: over all frames [m].
         newton_iterations, cg_iterations: totals over all steps.
         unconverged_steps: implicit steps that stopped before their tolerance.
@@ -76,6 +77,7 @@ class Summary:
     last_energies: Energies | None = None
     largest_von_mises: float = 0.0
     smallest_jacobian: float = math.inf
+    first_penetration: float = 0.0
     largest_penetration: float = 0.0
     newton_iterations: int = 0
     cg_iterations: int = 0
@@ -85,6 +87,8 @@ class Summary:
 
     def add_frame(self, frame: Frame) -> None:
         """Takes a frame into account."""
+        if self.frames == 0:
+            self.first_penetration = frame.penetration
         self.frames += 1
         self.first_energies = self.first_energies or frame.energies
         self.last_energies = frame.energies
@@ -183,8 +187,8 @@ class Simulation:
             body, cell = model.body_of_cell(first)
             raise SimulationError(
                 f"t = {state.time:.6g} s: the stress of cell {cell} of body '{body.name}' is not finite "
-                f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). {type(body.material).__name__} "
-                "may not bear J <= 0: take a smaller dt, or StableNeoHookean"
+                f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). A smaller dt, or a material that "
+                "bears inversion (StableNeoHookean), may help"
             )
         return Frame(
             index=index,

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpfem.boundary import Pin, PrescribedMotion, Support
 from warpfem.dtypes import types
-from warpfem.errors import SceneError
+from warpfem.errors import SceneError, source_of, user_code
 from warpfem.scene import Body
 
 
@@ -74,7 +74,8 @@ class _Moving:
     motion: Callable[[np.ndarray, float], np.ndarray]
 
     def displacement(self, time: float) -> np.ndarray:
-        x = np.asarray(self.motion(self.rest.copy(), time))
+        with user_code(f"body '{self.body}', prescribed motion at t = {time:g} s", source_of(self.motion)):
+            x = np.asarray(self.motion(self.rest.copy(), time))
         if x.dtype.kind not in "fiu":
             raise SceneError(
                 f"body '{self.body}': the prescribed motion returned {x.dtype} at t = {time:g} s; expected numbers"

@@ -1,5 +1,6 @@
 """What a material is: an energy density psi(F), its stress P = dpsi/dF and its parameters."""
 
+import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -94,6 +95,8 @@ class HookeanMaterial(Material):
     moduli: ElasticModuli = field(init=False, repr=False)
 
     functions: ClassVar[Constitutive]
+    least_nu: ClassVar[float] = -1.0
+    """Below this Poisson's ratio the energy has no lower bound, or rest is not its lowest state."""
 
     def __post_init__(self) -> None:
         try:
@@ -103,6 +106,12 @@ class HookeanMaterial(Material):
         object.__setattr__(self, "moduli", moduli)
         for name in ("E", "nu", "K", "lam", "mu"):
             object.__setattr__(self, name, getattr(moduli, name))
+        if np.min(moduli.nu) < self.least_nu:
+            warnings.warn(
+                f"{type(self).__name__}: for nu < {self.least_nu:g} a large deformation can have less energy than "
+                f"rest (nu = {np.min(moduli.nu):g})",
+                stacklevel=3,
+            )
 
     @property
     def constitutive(self) -> Constitutive:

@@ -55,4 +55,5 @@ class NeoHookean(HookeanMaterial):
     """
 
     name = "neo_hookean"
+    least_nu = 0.0
     functions = Constitutive(energy_density, stress, stress_differential)

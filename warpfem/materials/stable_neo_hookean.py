@@ -63,6 +63,7 @@ class StableNeoHookean(HookeanMaterial):
     """
 
     name = "stable_neo_hookean"
+    least_nu = -0.85
     functions = Constitutive(energy_density, stress, stress_differential)
 
     def parameters(self) -> tuple[Parameter, ...]:

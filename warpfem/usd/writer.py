@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -168,6 +169,24 @@ class UsdWriter:
         return colors
 
 
+def check_path(path: str | Path) -> None:
+    """Checks what can be told of an output without writing anything.
+
+    Raises:
+        OutputError: a name without one of ``SUFFIXES``, a folder, or a place that cannot be written to.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise OutputError(f"{path}: the name of the output must end in {', '.join(SUFFIXES)}")
+    if path.is_dir():
+        raise OutputError(f"{path} is a folder: give the name of a file")
+    folder = path.absolute().parent
+    while not folder.exists():  # it will be made
+        folder = folder.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise OutputError(f"{path} cannot be written: {folder} is not a folder that can be written to")
+
+
 def _check_settings(
     path: Path,
     bodies: Sequence[UsdBody],
@@ -177,10 +196,7 @@ def _check_settings(
     color_range: tuple[float, float] | None,
     frames_per_chunk: int,
 ) -> None:
-    if path.suffix not in SUFFIXES:
-        raise OutputError(f"{path}: the name of the output must end in {', '.join(SUFFIXES)}")
-    if path.is_dir():
-        raise OutputError(f"{path} is a folder: give the name of a file")
+    check_path(path)
     if not bodies:
         raise OutputError(f"{path}: there are no bodies to write")
     if not (math.isfinite(fps) and fps > 0.0):
