@@ -268,7 +268,7 @@ def test_float32_stops_by_rounding_and_not_by_the_iteration_limit():
 def test_float32_tells_that_it_stopped_by_rounding():
     _, state, stepper = ready(tumbling(BackwardEuler(tolerance=1e-9)), "float32")
     reports = advance(stepper, state, 0.01, 20)
-    assert {r.note for r in reports} <= {"", "resolved to rounding"}
+    assert {r.note for r in reports} <= {"", "resolved only to the rounding of float32"}
     by_rounding = [r for r in reports if r.note]
     assert len(by_rounding) > 10
     assert all(1e-9 < r.residual < 1e-3 for r in by_rounding)

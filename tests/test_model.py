@@ -450,3 +450,12 @@ def test_p_wave_modulus_of_every_material():
 def test_material_errors_name_the_body():
     with pytest.raises(MaterialError, match="StableNeoHookean"):
         StableNeoHookean(E=1e5, nu=0.6)
+
+
+def test_arrays_given_by_the_user_are_copied():
+    mesh = Mesh.box((1, 1, 1), (1, 1, 1))
+    E, density = np.full(5, 1e5), np.full(5, 1000.0)
+    body = Body("a", mesh, StableNeoHookean(E=E, nu=0.3), density=density)
+    E[:], density[:] = 1.0, 1.0
+    assert (body.material.E == 1e5).all()
+    assert (body.density == 1000.0).all()

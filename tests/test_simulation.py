@@ -59,6 +59,59 @@ def test_the_step_thrown_away_leaves_no_trace():
     assert simulation.state.time == pytest.approx(1 / 24)
 
 
+def test_a_simulation_runs_once():
+    simulation = wf.Simulation(cube(frames=1))
+    list(simulation.frames())
+    with pytest.raises(wf.SimulationError, match="has been run"):
+        next(simulation.frames())
+
+
+def test_a_fall_has_all_its_kernels_before_it_starts():
+    from warpfem.profiling import observe_launches
+
+    scene = cube(gravity=(0, -10, 0), dt=0.02, frames=24, obstacles=[wf.Plane((0, -0.2, 0), (0, 1, 0), friction=0.3)])
+    with observe_launches() as before:
+        simulation = wf.Simulation(scene)
+    with observe_launches() as during:
+        list(simulation.frames())
+    modules = {use.module for use in during.kernels.values()}
+    assert modules <= {use.module for use in before.kernels.values()}
+    assert "contact_blocks" in during.names  # it did land
+
+
+def test_a_step_that_rounding_hides_is_counted_and_a_useless_one_is_not_called_converged():
+    def shifted(distance):
+        pinned = cube(
+            gravity=(0, -10, 0),
+            displacement=(distance, 0, 0),
+            dt=1 / 24,
+            frames=2,
+            solver=wf.BackwardEuler(tolerance=1e-6),
+        )
+        simulation = wf.Simulation(pinned)
+        mesh = pinned.bodies[0].mesh
+        simulation.state.assign(displacement=simulation.state.displacement + 0.05 * mesh.points * (0, 1, 0))
+        list(simulation.frames())
+        return simulation.summary
+
+    near, far = shifted(0.0), shifted(1e5)
+    assert near.unconverged_steps == 0
+    assert far.unconverged_steps > 0
+    assert "rounding of float32" in far.worst_note
+    assert far.worst_residual > 1e-2
+
+
+def test_auto_dt_minds_the_first_state():
+    squashed = cube(
+        material=wf.NeoHookean(E=1e5, nu=0.3),
+        displacement=lambda x: x * (0, -0.75, 0),
+        solver=wf.VelocityVerlet(),
+        frames=1,
+    )
+    simulation = wf.Simulation(squashed)
+    assert simulation.dt < 0.5 * simulation.stepper.stable_dt()
+
+
 def test_summary_counts_unconverged_steps():
     hard = cube(
         supports=[wf.Pin("bottom")],
@@ -106,21 +159,21 @@ TERMS = {
 
 @pytest.mark.parametrize("term", TERMS)
 def test_explain_reports_the_term_that_is_on(term):
-    explanation = explain(wf.Simulation(cube(frames=1, **TERMS[term])))
+    explanation = explain(cube(frames=1, **TERMS[term]))
     on = {t.name for t in explanation.terms if t.on}
     assert on == {"elasticity", term} | ({"contact"} if term == "friction" else set())
 
 
 def test_a_term_that_is_off_costs_nothing():
     bare = wf.Simulation(cube(frames=1, displacement=lambda x: 0.01 * x))
-    explanation = explain(bare)
-    names = {use.name for use in explanation.kernels}
-    modules = {use.module for use in explanation.kernels}
+    explanation = explain(bare.scene)
+    names = {use.name for use in explanation.kernels + explanation.other_kernels}
+    modules = {use.module for use in explanation.kernels + explanation.other_kernels}
     assert bare.model.contact is None and bare.model.supports is None and bare.model.dead_load is None
     assert not [module for module in modules if "contact" in module or "supports" in module]
     for term, settings in TERMS.items():
-        richer = explain(wf.Simulation(cube(frames=1, displacement=lambda x: 0.01 * x, **settings)))
-        assert names <= {use.name for use in richer.kernels}
+        richer = explain(cube(frames=1, displacement=lambda x: 0.01 * x, **settings))
+        assert names <= {use.name for use in richer.kernels + richer.other_kernels}
         more = richer.model_bytes + richer.solver_bytes
         less = explanation.model_bytes + explanation.solver_bytes
         assert more == less if term == "damping" else more > less  # damping is a number

@@ -1,7 +1,7 @@
 """What acts on a body from outside: supports, loads and obstacles, as a person declares them.
 
-Everything here is plain data without a device. The kernels that carry it out are in ``supports.py``,
-``loads.py`` and ``contact.py``, and exist only for scenes that have such a term.
+Everything here is plain data without a device. ``supports.py`` and ``contact.py`` carry it out, only for scenes
+that have such a term; constant loads become one force per point in ``model.py``.
 """
 
 from __future__ import annotations
@@ -141,6 +141,8 @@ class Plane(_Obstacle):
 @dataclass(frozen=True)
 class Sphere(_Obstacle):
     """A fixed solid sphere (2D: disc): bodies stay outside.
+
+    Contact is felt by a body's boundary points: a sphere smaller than the faces between them slips through.
 
     Attributes:
         center: centre [m].

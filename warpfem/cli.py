@@ -11,12 +11,12 @@ import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import warpfem
-from warpfem.errors import SimulationError, WarpfemError
+from warpfem.errors import SimulationError, TimeStepError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 
@@ -37,7 +37,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         return arguments.command(arguments)
-    except WarpfemError as error:  # before the first frame of a run: nothing has been written
+    except TimeStepError as error:
+        return _fail(error, WRONG_USE)
+    except SimulationError as error:
+        return _fail(error, FAILED)
+    except WarpfemError as error:
         return _fail(error, WRONG_USE)
     except KeyboardInterrupt:
         return _fail(SimulationError("interrupted before anything was written"), FAILED)
@@ -65,7 +69,9 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(command=_run)
 
     explain = commands.add_parser(
-        "explain", help="say what a scene requires, and so what is modelled", description=_explain.__doc__
+        "explain",
+        help="say what a scene requires, and so what is modelled (steps it for some seconds)",
+        description=_explain.__doc__,
     )
     _scene_options(explain)
     explain.set_defaults(command=_explain)
@@ -156,9 +162,9 @@ def _run(arguments: argparse.Namespace) -> int:
     summary = simulation.summary
     code = OK
     try:
-        frames = warpfem.record(simulation, out)
-        for _ in _progress(frames, scene.frames + 1) if say else frames:
-            pass
+        with closing(warpfem.record(simulation, out)) as frames:
+            for _ in _progress(frames, scene.frames + 1) if say else frames:
+                pass
     except KeyboardInterrupt:
         code = _fail(SimulationError(f"interrupted: {_kept(summary, out)}"), FAILED)
     except WarpfemError as error:
@@ -166,6 +172,12 @@ def _run(arguments: argparse.Namespace) -> int:
             raise
         error.add_note(_kept(summary, out))
         code = _fail(error, FAILED)
+    if summary.unconverged_steps:
+        print(
+            f"warpfem: NOT CONVERGED in {summary.unconverged_steps} of {summary.steps} steps: worst residual "
+            f"{summary.worst_residual:.2e}, {summary.worst_note}",
+            file=sys.stderr,
+        )
     if arguments.json:
         print(json.dumps(_summary_data(summary, arguments, out), indent=2))
     elif not arguments.quiet:
@@ -228,10 +240,10 @@ def _summary_text(summary: Summary, simulation: Simulation) -> str:
             f"{summary.newton_iterations} Newton and {summary.cg_iterations} conjugate gradient iterations "
             f"({summary.newton_iterations / summary.steps:.1f} and {summary.cg_iterations / summary.steps:.0f} a step)"
         )
-    if summary.unconverged_steps:
+    if summary.rounded_steps:
         lines.append(
-            f"NOT CONVERGED in {summary.unconverged_steps} of {summary.steps} steps: worst residual "
-            f"{summary.worst_residual:.2e}, {summary.worst_note}"
+            f"{summary.rounded_steps} of {summary.steps} steps resolved only to rounding: worst residual "
+            f"{summary.worst_residual:.2e}; --dtype float64 resolves more"
         )
     return "\n".join(lines)
 
@@ -241,7 +253,7 @@ def _explain(arguments: argparse.Namespace) -> int:
     from warpfem.explain import explain
 
     _start_warp()
-    print(explain(Simulation(_load(arguments), device=arguments.device, dtype=arguments.dtype)))
+    print(explain(_load(arguments), device=arguments.device, dtype=arguments.dtype))
     return OK
 
 

@@ -1,4 +1,4 @@
-"""Warp types for each dimension and floating-point precision, and validation of arrays at the API's edge."""
+"""Warp types for each dimension and floating-point precision."""
 
 import functools
 from dataclasses import dataclass

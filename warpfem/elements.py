@@ -64,7 +64,13 @@ class ElementKernels:
                 H += wp.outer(u[cell[k + 1]] - origin, B[k])
             return H
 
+        @wp.func
+        def add_block(blocks: wp.array(dtype=matrix), slot: int, block: matrix):
+            if slot >= 0:
+                wp.atomic_add(blocks, slot, block)
+
         self._displacement_gradient = displacement_gradient
+        self._add_block = add_block
 
     @functools.cached_property
     def energy(self) -> wp.Kernel:
@@ -175,7 +181,10 @@ class ElementKernels:
 
     @functools.cached_property
     def stiffness(self) -> wp.Kernel:
-        """Adds the d x d blocks K_ab of each cell's tangent stiffness to ``blocks_out[slots[i, a, b]]``."""
+        """Adds the d x d blocks K_ab of each cell's tangent stiffness to ``blocks_out[slots[i, a, b]]``.
+
+        A block whose slot is negative is left out.
+        """
         return self._exact_stiffness_kernel()
 
     @functools.cached_property
@@ -187,6 +196,7 @@ class ElementKernels:
         dim = self.dim
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
+        add_block = self._add_block
         displacement_gradient = self._displacement_gradient
         stress_differential = self.constitutive.stress_differential
 
@@ -214,10 +224,10 @@ class ElementKernels:
                     for a in range(count):
                         block = wp.outer(dP * B[a], axis)
                         column_sum += block
-                        wp.atomic_add(blocks_out, slots[i, a + 1, b + 1], block)
-                        wp.atomic_add(blocks_out, slots[i, a + 1, 0], -block)
-                wp.atomic_add(blocks_out, slots[i, 0, b + 1], -column_sum)
-                wp.atomic_add(blocks_out, slots[i, 0, 0], column_sum)
+                        add_block(blocks_out, slots[i, a + 1, b + 1], block)
+                        add_block(blocks_out, slots[i, a + 1, 0], -block)
+                add_block(blocks_out, slots[i, 0, b + 1], -column_sum)
+                add_block(blocks_out, slots[i, 0, 0], column_sum)
 
         return element_stiffness
 
@@ -225,6 +235,7 @@ class ElementKernels:
         dim = self.dim
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
+        add_block = self._add_block
         displacement_gradient = self._displacement_gradient
         tangent, _apply = self._clamped_rule()
         gradients_type = wp.types.matrix(shape=(dim + 1, dim), dtype=scalar)
@@ -256,9 +267,9 @@ class ElementKernels:
                     K = wp.cw_mul(t.stretch, wp.outer(g, h)) + wp.cw_mul(t.swapped, wp.outer(h, g))
                     K += wp.diag(t.same * wp.cw_mul(g, h))
                     block = volume[i] * (t.U * K * wp.transpose(t.U))
-                    wp.atomic_add(blocks_out, slots[i, a, b], block)
+                    add_block(blocks_out, slots[i, a, b], block)
                     if b > a:
-                        wp.atomic_add(blocks_out, slots[i, b, a], wp.transpose(block))
+                        add_block(blocks_out, slots[i, b, a], wp.transpose(block))
 
         return clamped_element_stiffness
 
@@ -268,7 +279,7 @@ class ElementKernels:
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         displacement_gradient = self._displacement_gradient
-        stress = self.constitutive.stress
+        solid_stress = self._solid_stress()
         solid = wp.types.matrix(shape=(3, 3), dtype=scalar)
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -281,7 +292,7 @@ class ElementKernels:
         ):
             i = wp.tid()
             H = displacement_gradient(u, cells[i], inverse_shape[i])
-            stress_out[i] = stress(embed(H), parameters[i])
+            stress_out[i] = solid_stress(H, parameters[i])
 
         return element_stress
 
@@ -291,7 +302,7 @@ class ElementKernels:
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         displacement_gradient = self._displacement_gradient
-        stress = self.constitutive.stress
+        solid_stress = self._solid_stress()
 
         @wp.kernel(module="unique", enable_backward=False)
         def element_diagnostics(
@@ -303,14 +314,33 @@ class ElementKernels:
             von_mises_out: wp.array(dtype=scalar),
         ):
             i = wp.tid()
-            H = embed(displacement_gradient(u, cells[i], inverse_shape[i]))
+            plane = displacement_gradient(u, cells[i], inverse_shape[i])
+            H = embed(plane)
             J = scalar(1.0) + volume_change(H)
-            kirchhoff = stress(H, parameters[i]) * wp.transpose(deformation_gradient(H))
+            kirchhoff = solid_stress(plane, parameters[i]) * wp.transpose(deformation_gradient(H))
             deviator = kirchhoff - (wp.trace(kirchhoff) / scalar(3.0)) * identity_like(H)
             jacobian_out[i] = J
             von_mises_out[i] = wp.sqrt(scalar(1.5) * wp.ddot(deviator, deviator)) / wp.max(wp.abs(J), scalar(1.0e-6))
 
         return element_diagnostics
+
+    def _solid_stress(self) -> wp.Function:
+        """The 3x3 P; in plane strain its in-plane part is that of the forces, whatever the rotation in space."""
+        stress = self.constitutive.stress
+        if self.dim == 3:
+            return stress
+
+        @wp.func
+        def plane_strain_stress(H: Any, parameters: Any):
+            _late = wp.grad(wp.neg)(H[0, 0])  # as in _clamped_rule, for a stress that calls wp.grad
+            P = stress(embed(H), parameters)
+            plane = stress(H, parameters)
+            for i in range(2):
+                for j in range(2):
+                    P[i, j] = plane[i, j]
+            return P
+
+        return plane_strain_stress
 
     @property
     def _clampable(self) -> bool:

@@ -39,6 +39,10 @@ class SimulationError(WarpfemError, RuntimeError):
     """A run that cannot go on: it diverged, or a step could not be solved."""
 
 
+class TimeStepError(SimulationError):
+    """A time step that explicit steps cannot take: names the limit."""
+
+
 @contextmanager
 def user_code(where: str, file: str) -> Iterator[None]:
     """Turns what a user's code raises into a SceneError that names the last line of ``file`` that was reached.

@@ -6,8 +6,10 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
+from warpfem.dtypes import FloatName
 from warpfem.model import device_bytes
 from warpfem.profiling import KernelUse, observe_launches
+from warpfem.scene import Scene
 from warpfem.simulation import Simulation
 
 OBSERVED_SECONDS = 3.0
@@ -38,6 +40,7 @@ class Explanation:
         stepping: how time is stepped.
         terms: each term, on or off, and why.
         kernels: the kernels that the observed steps launched.
+        other_kernels: kernels of the set-up, of frames, and of steps that were not observed.
         steps: steps observed.
         seconds: wall time of those steps [s].
         model_bytes: device memory of the model and the state.
@@ -48,6 +51,7 @@ class Explanation:
     stepping: str
     terms: list[Term]
     kernels: list[KernelUse]
+    other_kernels: list[KernelUse]
     steps: int
     seconds: float
     model_bytes: int
@@ -57,23 +61,38 @@ class Explanation:
         width = max(len(term.name) for term in self.terms)
         lines = [self.headline, self.stepping, "", "Terms"]
         lines += [f"  {term.name:<{width}}  {'on ' if term.on else 'off'}  {term.why}" for term in self.terms]
-        lines += ["", f"Kernels ({len(self.kernels)}): share of a step, launches per step (mean of {self.steps} steps)"]
+        lines += [
+            "",
+            f"Kernels: {len(self.kernels) + len(self.other_kernels)}",
+            f"  share of a step, launches per step (mean of {self.steps} steps)",
+        ]
         for use in sorted(self.kernels, key=lambda use: -use.seconds):
             share = use.seconds / self.seconds
-            lines.append(f"  {share:6.1%}  {use.launches / self.steps:7.1f}  {use.name}")
+            lines.append(f"  {share:6.1%}  {use.launches / self.steps:7.1f}  {use.label}")
         rest = max(0.0, 1.0 - sum(use.seconds for use in self.kernels) / self.seconds)
         lines += [
             f"  {rest:6.1%}           host",
+            f"  set-up, frames, and steps not seen: {', '.join(use.label for use in self.other_kernels)}",
             "",
             f"Device memory: model and state {_size(self.model_bytes)}, solver {_size(self.solver_bytes)}",
         ]
         return "\n".join(lines)
 
 
-def explain(simulation: Simulation) -> Explanation:
-    """Explains a simulation: runs a copy of its state for up to ``OBSERVED_SECONDS`` and watches the launches."""
-    model, scene, stepper = simulation.model, simulation.scene, simulation.stepper
-    state = simulation.state.copy()
+def explain(scene: Scene, *, device: str | None = None, dtype: FloatName = "float32") -> Explanation:
+    """Explains a scene: makes it ready, runs it for up to ``OBSERVED_SECONDS`` and watches the kernels.
+
+    Args:
+        scene: the scene.
+        device: Warp device; ``None`` takes Warp's default.
+        dtype: "float32" or "float64".
+
+    Raises:
+        SceneError, SimulationError: as :class:`Simulation`, or a step fails.
+    """
+    with observe_launches(device) as set_up:
+        simulation = Simulation(scene, device=device, dtype=dtype)
+    model, stepper, state = simulation.model, simulation.stepper, simulation.state
     steps, wanted = 0, max(1, scene.frames * simulation.steps_per_frame)
     with observe_launches(model.device) as seen:
         start = time.perf_counter()
@@ -90,10 +109,12 @@ def explain(simulation: Simulation) -> Explanation:
             f"{model.dtype} on {model.device}"
         ),
         stepping=(
-            f"{scene.solver!r}\ndt = {simulation.dt:.4g} s, {simulation.steps_per_frame} steps per frame, {stability}"
+            f"{simulation.solver!r}\n"
+            f"dt = {simulation.dt:.4g} s, {simulation.steps_per_frame} steps per frame, {stability}"
         ),
         terms=_terms(simulation),
         kernels=list(seen.kernels.values()),
+        other_kernels=[use for key, use in set_up.kernels.items() if key not in seen.kernels],
         steps=steps,
         seconds=seconds,
         model_bytes=device_bytes([*model.arrays(), state.u, state.v]),

@@ -341,26 +341,25 @@ class _UnassembledOperator(TangentOperator):
     def _add_stiffness_product(self, p: wp.array, product_out: wp.array) -> None: ...
 
     @functools.cached_property
-    def _diagonal_blocks(self) -> tuple[wp.array, list[wp.array]]:
-        # the elements' kernel writes all blocks of a cell: those off the diagonal go to a block never read
+    def _diagonal_blocks(self) -> tuple[wp.array, list[wp.array], wp.array]:
+        # the elements' kernel leaves out the blocks whose slot is negative
         n, corners = self.model.point_count, self.model.dim + 1
         slots = []
         for block in self.model.blocks:
-            own = np.full((block.count, corners, corners), n, dtype=np.int32)
+            own = np.full((block.count, corners, corners), -1, dtype=np.int32)
             own[:, range(corners), range(corners)] = block.host_cells
             slots.append(self._indices(own))
         self.diagonal = self._indices(np.arange(n))
-        return self._new_blocks(n + 1), slots
+        return self._new_blocks(n), slots, self._indices(np.arange(n + 1))
 
     def linearize(self, u, mass_weight, *, friction=None, precondition=False) -> None:
         self.u = u
         self.mass_weight = mass_weight
         self._update_contact(u, friction)
         if precondition:
-            blocks, slots = self._diagonal_blocks
+            blocks, slots, rows = self._diagonal_blocks
             self._assemble(u, slots, mass_weight, blocks)
             if self.supports is not None:
-                rows = self._indices(np.arange(self.model.point_count + 1))
                 wp.launch(
                     self.supports.kernels.hold_rows,
                     self.supports.count,
@@ -384,8 +383,8 @@ class _UnassembledOperator(TangentOperator):
     def arrays(self) -> list[wp.array]:
         own = [self.contact_blocks, self.inverse_diagonal]
         if "_diagonal_blocks" in self.__dict__:
-            blocks, slots = self._diagonal_blocks
-            own += [blocks, *slots, self.diagonal]
+            blocks, slots, rows = self._diagonal_blocks
+            own += [blocks, *slots, rows, self.diagonal]
         return [array for array in own if array is not None]
 
 
@@ -515,7 +514,15 @@ class ConjugateGradients:
         tolerance: float,
         max_iterations: int,
     ) -> LinearResult:
-        """Solves A x = b from x = 0 until |r| <= tolerance |b|; overwrites ``x``."""
+        """Solves A x = b from x = 0 until |r| <= tolerance |b|; overwrites ``x``.
+
+        Args:
+            operator: A, linearised with ``precondition=True``.
+            b: right-hand side, zero where held.
+            x: the solution.
+            tolerance: relative residual to reach.
+            max_iterations: limit of iterations.
+        """
         model, kernels = self.model, self._kernels
         r, z, p, q, scalars = self._r, self._z, self._p, self._q, self._scalars
         B = operator.inverse_diagonal

@@ -14,6 +14,7 @@ from warpfem.boundary import PointForce, Traction
 from warpfem.dtypes import FloatName, types, uniform_array
 from warpfem.elements import ElementKernels, element_kernels
 from warpfem.errors import SceneError, SimulationError
+from warpfem.materials import HookeanMaterial
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 
@@ -186,7 +187,10 @@ class CellBlock:
 
 
 class Model:
-    """A scene made ready for one device and precision; immutable while it is stepped.
+    """A scene made ready for one device and precision.
+
+    What describes the scene does not change; the targets of prescribed motions and the friction limits of the
+    current step are kept here too, so that a model serves one run at a time.
 
     Points and cells of all bodies are numbered through in the order of the scene's bodies. A term that the
     scene lacks is ``None`` here: it has no array and no kernel.
@@ -264,24 +268,23 @@ class Model:
         return Contact(self.scene.obstacles, surface, self._slip_speed(), self.dtype)
 
     def _p_wave_moduli(self) -> list[float]:
-        """The largest P-wave modulus of each body at rest [Pa], d²psi/dF_xx² at F = I.
-
-        From each cell's own stiffness: the uniform stretch u = X_x e_x has the energy V/2 d²psi/dF_xx².
-        """
+        """The largest P-wave modulus of each body at rest [Pa], d²psi/dF_xx² at F = I."""
+        bodies = self.scene.bodies
+        if all(isinstance(body.material, HookeanMaterial) for body in bodies):
+            return [float(np.max(body.material.moduli.p_wave)) for body in bodies]
+        # from each cell's own stiffness: the uniform stretch u = X_x e_x has the energy V/2 d²psi/dF_xx²
         modulus = np.zeros(self.cell_count)
         for block, stiffness in zip(self.blocks, self.element_stiffness(), strict=True):
-            _, inverse_shape, volume, _ = (array.numpy() for array in block.arguments)
-            edges = np.linalg.inv(inverse_shape.astype(np.float64))  # columns X_k - X_0
+            edges = np.linalg.inv(block.arguments[1].numpy().astype(np.float64))  # columns X_k - X_0
             stretch = np.zeros((block.count, self.dim + 1, self.dim))
             stretch[:, 1:, 0] = edges[:, 0, :]
             work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
-            modulus[block.index] = work / volume
+            modulus[block.index] = work / block.arguments[2].numpy()
         return [float(modulus[a:b].max()) for a, b in zip(self.cell_starts, self.cell_starts[1:], strict=False)]
 
     def _slip_speed(self) -> float:
-        """1e-3 of the speed sqrt(g L) of a fall by the scene's size L; without gravity, 1e-3 L per second."""
-        corners = np.stack([body.mesh.bounding_box for body in self.scene.bodies])
-        size = float(np.linalg.norm(corners[:, 1].max(axis=0) - corners[:, 0].min(axis=0)))
+        """1e-3 of the speed sqrt(g L) of a fall by the smallest body's size L; without gravity, 1e-3 L per second."""
+        size = min(float(np.linalg.norm(np.ptp(body.mesh.bounding_box, axis=0))) for body in self.scene.bodies)
         gravity = 0.0 if self.scene.gravity is None else float(np.linalg.norm(self.scene.gravity))
         return 1e-3 * (np.sqrt(gravity * size) if gravity > 0.0 else size)
 

@@ -136,7 +136,7 @@ def _lame_parameters(first: str, a: np.ndarray, second: str, b: np.ndarray) -> t
 
 def _values(name: str, value: Parameter) -> np.ndarray:
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64)  # a copy: what the caller does to theirs later has no effect
     except (TypeError, ValueError):
         raise MaterialError(f"{name} must be a number or one number per cell, not {value!r}") from None
     if array.ndim > 1:

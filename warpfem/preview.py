@@ -82,7 +82,7 @@ def preview(path: str | Path, out: str | Path, *, frames: int | None = None) -> 
         import matplotlib.figure  # noqa: F401
         import PIL.Image  # noqa: F401
     except ImportError as error:
-        raise MissingExtraError("drawing a preview", "matplotlib", "plot") from error
+        raise MissingExtraError("drawing a preview", error.name or "matplotlib", "plot") from error
     animation = read_animation(path)
     if not animation.frame_count:
         raise OutputError(f"{path} has no frames to draw: the run ended before the first one was saved")

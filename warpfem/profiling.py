@@ -27,6 +27,12 @@ class KernelUse:
     launches: int = 0
     seconds: float = 0.0
 
+    @property
+    def label(self) -> str:
+        """The name, with the obstacle where there is a kernel for each kind."""
+        kind = self.module.partition(".contact_")[2].partition("_")[0]
+        return f"{self.name} ({kind})" if kind else self.name
+
 
 @dataclass
 class Launches:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 from warpfem import __version__
@@ -11,7 +11,7 @@ from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary, body_slices
 
 
-def record(simulation: Simulation, path: str | Path) -> Iterator[Frame]:
+def record(simulation: Simulation, path: str | Path) -> Generator[Frame, None, None]:
     """Runs a simulation and stores each frame in the USD file ``path`` before it is yielded.
 
     If the run fails, is interrupted or the caller stops, the file holds the frames so far.

@@ -64,7 +64,7 @@ class Body:
         for name in ("supports", "loads"):
             _require_list(f"body '{self.name}': {name}", getattr(self, name))
         try:
-            density = np.asarray(self.density, dtype=np.float64)
+            density = np.array(self.density, dtype=np.float64)  # a copy, as of all that a caller may change later
         except (TypeError, ValueError):
             raise SceneError(f"body '{self.name}': density must be a number, not {self.density!r}") from None
         if density.ndim > 1 or (density.ndim == 1 and len(density) != self.mesh.cell_count):
@@ -77,6 +77,7 @@ class Body:
             raise SceneError(
                 f"body '{self.name}': density must be finite and > 0, not {density.flat[np.argmax(bad)]:g}{where}"
             )
+        object.__setattr__(self, "density", density if density.ndim else float(density))
         try:
             self.material.parameter_rows(self.mesh.cell_count)
         except ValueError as error:

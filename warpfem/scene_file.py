@@ -60,11 +60,15 @@ def _scene_function(path: Path) -> Callable[..., Any]:
 
 def _call(path: Path, action: Callable[[], Any]) -> Any:
     """Turns an error in the file into one that names its line."""
+    folder = str(path.parent.absolute())
     with user_code(str(path), str(path)):
+        sys.path.insert(0, folder)  # as for a script: a scene may import its neighbours
         try:
             return action()
         except SyntaxError as error:
             raise SceneError(f"{path}, line {error.lineno}: {error.msg}") from error
+        finally:
+            sys.path.remove(folder)
 
 
 def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:

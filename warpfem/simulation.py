@@ -62,8 +62,9 @@ class Summary:
         first_penetration: depth inside an obstacle in the first frame [m].
         largest_penetration: over all frames [m].
         newton_iterations, cg_iterations: totals over all steps.
-        unconverged_steps: implicit steps that stopped before their tolerance.
-        worst_residual: the largest relative residual among those.
+        rounded_steps: implicit steps that rounding kept from their tolerance, with a residual below 1e-2.
+        unconverged_steps: implicit steps that stopped before their tolerance for other reasons, or above 1e-2.
+        worst_residual: the largest relative residual among both.
         worst_note: how that step ended.
     """
 
@@ -81,6 +82,7 @@ class Summary:
     largest_penetration: float = 0.0
     newton_iterations: int = 0
     cg_iterations: int = 0
+    rounded_steps: int = 0
     unconverged_steps: int = 0
     worst_residual: float = 0.0
     worst_note: str = ""
@@ -103,9 +105,16 @@ class Simulation:
     Building it compiles or loads every kernel that a step needs, by one step that is thrown away, so that
     mistakes show up before anything is written.
 
+    Args:
+        scene: the scene.
+        device: Warp device, for example "cpu" or "cuda:0"; ``None`` takes Warp's default.
+        dtype: "float32" or "float64".
+        solver: takes the place of the scene's.
+
     Attributes:
         scene: the scene.
         model: the scene on the device.
+        solver: the solver.
         state: the current state.
         dt: the time step [s].
         steps_per_frame: time steps between two frames.
@@ -128,28 +137,31 @@ class Simulation:
         self.scene = scene
         self.model = Model(scene, device=device, dtype=dtype)
         self.state = self.model.state()
-        self.stepper = (solver or scene.solver).stepper(self.model)
+        self.solver = solver or scene.solver
+        self.stepper = self.solver.stepper(self.model)
         interval = 1.0 / scene.fps
         self.steps_per_frame = max(1, math.ceil(interval / self._wanted_dt(interval) - 1e-9))
         self.dt = interval / self.steps_per_frame
         if scene.frames > 0:
-            self.stepper.step(self.state.copy(), self.dt)
+            self.stepper.prepare(self.state, self.dt)
         self._observe(0)
         self.summary = Summary(self.dt, time.perf_counter() - start)
 
     def _wanted_dt(self, interval: float) -> float:
         if self.scene.dt != "auto":
             return self.scene.dt
-        limit = self.stepper.stable_dt()
+        limit = self.stepper.stable_dt(self.state)
         return interval if limit is None else AUTO_FRACTION * limit
 
     def frames(self) -> Iterator[Frame]:
-        """Runs the scene; yields the initial state and then one frame per frame interval.
+        """Runs the scene, once; yields the initial state and then one frame per frame interval.
 
         Raises:
-            SimulationError: the run cannot go on. The frames yielded so far are good.
+            SimulationError: the run cannot go on, or has been started before. The frames yielded so far are good.
         """
         summary = self.summary
+        if summary.frames:
+            raise SimulationError("this simulation has been run: make another one to run the scene again")
         frame = self._observe(0)
         summary.add_frame(frame)
         yield frame
@@ -170,8 +182,9 @@ class Simulation:
         summary.simulated_seconds = self.state.time
         summary.newton_iterations += report.newton_iterations
         summary.cg_iterations += report.cg_iterations
-        if not report.converged:
-            summary.unconverged_steps += 1
+        if report.note:
+            summary.rounded_steps += report.converged
+            summary.unconverged_steps += not report.converged
             if report.residual >= summary.worst_residual:
                 summary.worst_residual, summary.worst_note = report.residual, report.note
 

@@ -156,13 +156,16 @@ class EnergyMaterial(Material):
             raise MaterialError(f"EnergyMaterial: psi '{self.psi.key}' must take two arguments, F and parameters")
         if not self.values:
             raise MaterialError("EnergyMaterial: give at least one parameter, as values={'mu': 1e5}")
+        values = {}
         for name, value in self.values.items():
             try:
-                finite = bool(np.isfinite(np.asarray(value, dtype=np.float64)).all())
+                values[name] = np.array(value, dtype=np.float64)
+                finite = bool(np.isfinite(values[name]).all())
             except (TypeError, ValueError):
                 finite = False
             if not finite:
                 raise MaterialError(f"EnergyMaterial: parameter '{name}' must be finite numbers, not {value!r}")
+        object.__setattr__(self, "values", values)
         _check(self.psi, len(self.values))
 
     @property

@@ -59,8 +59,8 @@ class FixedCorotated(HookeanMaterial):
 
     P = 2 mu (F - R) + lam (J - 1) cof F with F = R S. Finite for every F; R is not unique where two signed
     singular values of F sum to zero. With lam < 0 (nu < 0) the energy has no lower bound. In plane strain R
-    is the rotation in the plane; for a cell that is inverted and stretched above 1 both ways, the rotation
-    closest to diag(F, 1), by which :meth:`Model.stresses` goes, is another.
+    is the rotation in the plane, also for a cell that is inverted and stretched above 1 both ways, where the
+    rotation closest to diag(F, 1) is another.
     """
 
     name = "fixed_corotated"

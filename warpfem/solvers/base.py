@@ -12,6 +12,9 @@ import warp as wp
 from warpfem.errors import SimulationError
 from warpfem.model import Model, State
 
+ROUNDING_LIMIT = 1e-2
+"""Largest relative residual that a step may end with because rounding hides the rest."""
+
 
 @dataclass(frozen=True)
 class StepReport:
@@ -22,8 +25,8 @@ class StepReport:
         cg_iterations: iterations of conjugate gradients over all of them.
         residual: unbalanced force over the largest of the forces acting, at the end; 0 for explicit steps,
             the linear solver's relative residual for linearised ones.
-        converged: whether the residual met the tolerance.
-        note: how the step ended, if it did not converge.
+        converged: whether the residual met the tolerance, or is below ``ROUNDING_LIMIT`` and lost in rounding.
+        note: how the step ended, if not by its tolerance.
     """
 
     newton_iterations: int = 0
@@ -43,16 +46,32 @@ class Stepper(ABC):
         """Advances ``state`` in place by ``dt`` [s].
 
         Raises:
-            SimulationError: if the step cannot be taken; the state is then as it was before.
+            SimulationError: if the step cannot be taken; the state is then as it was before. Explicit steps
+                do not look whether what they computed is finite.
         """
 
     @abstractmethod
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
 
-    def stable_dt(self) -> float | None:
-        """The largest stable time step at rest [s], or ``None`` if there is no such limit."""
+    def stable_dt(self, state: State | None = None) -> float | None:
+        """The largest stable time step [s] at rest, or the lesser of that and the one in ``state``.
+
+        Returns:
+            The limit, or ``None`` if there is none.
+
+        Raises:
+            SimulationError: the stiffness in ``state`` is not finite.
+        """
         return None
+
+    def prepare(self, state: State, dt: float) -> None:
+        """Takes a step with a copy of ``state``, so that all kernels of a step are compiled or loaded.
+
+        Raises:
+            SimulationError: the step cannot be taken.
+        """
+        self.step(state.copy(), dt)
 
 
 class Solver(ABC):

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
-from warpfem.errors import SimulationError
+from warpfem.errors import SimulationError, TimeStepError
 from warpfem.model import Model, State
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, worst_cell
 
@@ -42,7 +42,7 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
 
     The largest eigenvalue of the cells' own (K_e, M_e) bounds that of the assembled pair (Irons and Treharne
     1971). It is bounded in turn by (tr A^8)^(1/8), A = M_e^-1/2 K_e M_e^-1/2, which exceeds it by at most
-    (rank A)^(1/8): 1.25 for tetrahedra, 1.15 for triangles, and so dt by at most 12 % and 7 %. Contact adds
+    (rank A)^(1/8): at rest 1.25 for tetrahedra and 1.15 for triangles, and so dt by at most 12 % and 7 %. Contact adds
     the largest ratio of its stiffness to a point's mass.
     """
     corners = model.dim + 1
@@ -74,21 +74,24 @@ class _ExplicitStepper(Stepper):
     def arrays(self) -> list[wp.array]:
         return [self._force]
 
-    def stable_dt(self) -> float:
-        return 2.0 / largest_frequency(self.model)
+    def stable_dt(self, state: State | None = None) -> float:
+        limit = 2.0 / largest_frequency(self.model)
+        if state is None:
+            return limit
+        here = 2.0 / largest_frequency(self.model, state.u)
+        if not np.isfinite(here):
+            raise SimulationError(
+                f"t = {state.time:.6g} s: the stiffness of the state is not finite; "
+                f"{worst_cell(self.model, state.u)}. Start from a state with J > 0, or take StableNeoHookean"
+            )
+        return min(limit, here)
 
     def _check_dt(self, state: State, dt: float) -> None:
         require_positive(dt)
-        if self._limit is None:  # at rest and in the first state, whichever is stiffer
-            limit = 2.0 / largest_frequency(self.model, state.u)
-            if not np.isfinite(limit):
-                raise SimulationError(
-                    f"t = {state.time:.6g} s: the stiffness of the state is not finite; "
-                    f"{worst_cell(self.model, state.u)}. Start from a state with J > 0, or take StableNeoHookean"
-                )
-            self._limit = min(self.stable_dt(), limit)
+        if self._limit is None:
+            self._limit = self.stable_dt(state)
         if dt > self._limit:
-            raise SimulationError(
+            raise TimeStepError(
                 f"dt = {dt:.4g} s is above the stability limit of explicit steps in this scene, "
                 f'{self._limit:.4g} s: take a smaller dt, dt="auto", or BackwardEuler'
             )

@@ -13,7 +13,15 @@ from warpfem.errors import SceneError, SimulationError
 from warpfem.linear import ConjugateGradients, LinearStatus, tangent_operator
 from warpfem.model import Model, Route, State
 from warpfem.points import CHUNK, chunks
-from warpfem.solvers.base import Solver, Stepper, StepReport, require_finite, require_positive, worst_cell
+from warpfem.solvers.base import (
+    ROUNDING_LIMIT,
+    Solver,
+    Stepper,
+    StepReport,
+    require_finite,
+    require_positive,
+    worst_cell,
+)
 
 FRICTION_UPDATES = 10
 """Newton iterations of a step that take the friction limits of their iterate; later ones keep the last, so that
@@ -154,6 +162,16 @@ class _BackwardEulerStepper(Stepper):
         state.revision += 1
         return report
 
+    def prepare(self, state: State, dt: float) -> None:
+        super().prepare(state, dt)
+        # a step in free flight solves nothing
+        self._force.fill_(1.0)
+        if self.model.supports is not None:
+            self.model.supports.project(self._force)
+        self._linearize(self._u)
+        self.cg.solve(self.operator, self._force, self._direction, tolerance=0.5, max_iterations=1)
+        self._rounding_force(self._u)
+
     # --- one linear system: the lecture's step ----------------------------------------------------------
 
     def _linearised(self, state: State, time: float) -> StepReport:
@@ -182,7 +200,7 @@ class _BackwardEulerStepper(Stepper):
                 f"t = {time:.6g} s: the step starts from infinite energy; {worst_cell(model, self._u)}. Start from a "
                 "state with J > 0, move supports more slowly, or take StableNeoHookean, which bears inversion"
             )
-        cg_iterations = 0
+        solves = cg_iterations = 0
         note = f"stopped after {config.max_iterations} Newton iterations"
         for iteration in range(config.max_iterations + 1):
             if rough and 0 < iteration <= FRICTION_UPDATES:
@@ -193,21 +211,23 @@ class _BackwardEulerStepper(Stepper):
                 require_finite(model, self._force, "the force", time)
             relative = residual / scale if scale > 0.0 else 0.0
             if relative <= config.tolerance:
-                return StepReport(iteration, cg_iterations, relative)
+                return StepReport(solves, cg_iterations, relative)
             if iteration == config.max_iterations:
                 break
             self._linearize(self._u)
             if residual <= self._rounding_force(self._u):
-                return StepReport(iteration, cg_iterations, relative, True, "resolved to rounding")
+                note = f"resolved only to the rounding of {model.dtype}"
+                return StepReport(solves, cg_iterations, relative, relative <= ROUNDING_LIMIT, note)
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             result = self._solve(forcing)
+            solves += 1
             cg_iterations += result.iterations
             found = self._line_search(potential, scale) if config.line_search else self._full_step()
             if found is None:
                 note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
                 break
             potential = found
-        return StepReport(iteration, cg_iterations, relative, False, note)
+        return StepReport(solves, cg_iterations, relative, False, note)
 
     def _choose_start(self, state: State) -> float:
         """Starts from the old state or from free flight, whichever has less potential."""
