@@ -242,8 +242,8 @@ def _summary_text(summary: Summary, simulation: Simulation) -> str:
         )
     if summary.rounded_steps:
         lines.append(
-            f"{summary.rounded_steps} of {summary.steps} steps resolved only to rounding: worst residual "
-            f"{summary.worst_residual:.2e}; --dtype float64 resolves more"
+            f"{summary.rounded_steps} of {summary.steps} steps ended at the rounding of {simulation.model.dtype}, with "
+            f"residuals of up to {summary.worst_residual:.1e}; --dtype float64 resolves more"
         )
     return "\n".join(lines)
 
