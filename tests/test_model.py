@@ -459,3 +459,20 @@ def test_arrays_given_by_the_user_are_copied():
     E[:], density[:] = 1.0, 1.0
     assert (body.material.E == 1e5).all()
     assert (body.density == 1000.0).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_energy_densities_weighted_by_volume_are_the_energy(rng, dim):
+    meshes = [Mesh.rectangle((1, 1), (2, 2)), Mesh.box((1, 1, 1), (1, 1, 1))]
+    mesh = meshes[dim - 2]
+    bodies = [
+        Body("a", mesh, StableNeoHookean(E=np.linspace(1e5, 2e5, mesh.cell_count), nu=0.3)),
+        Body("b", mesh, LinearElasticity(E=3e5, nu=0.2)),
+    ]
+    model = Model(Scene(bodies, SymplecticEuler()), dtype="float64", device="cpu")
+    state = model.state()
+    assert (model.energy_densities(state) == 0.0).all()
+    state.assign(displacement=0.1 * rng.standard_normal((model.point_count, dim)))
+    psi = model.energy_densities(state)
+    assert (psi > 0.0).all()
+    assert psi @ np.tile(mesh.cell_volumes, 2) == pytest.approx(model.energies(state).elastic, rel=1e-13)

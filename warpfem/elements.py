@@ -96,6 +96,28 @@ class ElementKernels:
         return element_energy
 
     @functools.cached_property
+    def density(self) -> wp.Kernel:
+        """Writes the energy density psi of each cell."""
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        energy_density = self.constitutive.energy_density
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_density(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            density_out: wp.array(dtype=scalar),
+        ):
+            i = wp.tid()
+            H = displacement_gradient(u, cells[i], inverse_shape[i])
+            density_out[i] = energy_density(H, parameters[i])
+
+        return element_density
+
+    @functools.cached_property
     def force(self) -> wp.Kernel:
         """Adds the internal forces -dU/du to ``force_out``."""
         return self._force_kernel(enable_backward=False)
