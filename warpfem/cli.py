@@ -10,7 +10,7 @@ import platform
 import signal
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -135,16 +135,27 @@ def _start_warp() -> None:
 
 
 @contextmanager
-def _delayed_interrupt() -> Iterator[None]:
-    """Holds back Ctrl-C: the import of the USD libraries swallows it."""
+def _held_interrupt() -> Iterator[Callable[[], None]]:
+    """Holds back the first Ctrl-C until the function that it gives is called; a second one stops at once.
+
+    Raised just anywhere, the interrupt would be lost in the import of the USD libraries or in a destructor.
+    """
+    before = signal.getsignal(signal.SIGINT)
     seen = []
-    before = signal.signal(signal.SIGINT, lambda *_: seen.append(True))
+
+    def note(*_: object) -> None:
+        seen.append(True)
+        signal.signal(signal.SIGINT, before)
+
+    def check() -> None:
+        if seen:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, note)
     try:
-        yield
+        yield check
     finally:
         signal.signal(signal.SIGINT, before)
-    if seen:
-        raise KeyboardInterrupt
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -152,8 +163,9 @@ def _run(arguments: argparse.Namespace) -> int:
     _start_warp()
     scene = _load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
-    with _delayed_interrupt():
+    with _held_interrupt() as check_interrupt:
         from warpfem.usd import check_path
+    check_interrupt()
     check_path(out)
     say = not (arguments.quiet or arguments.json)
     if say:
@@ -162,9 +174,9 @@ def _run(arguments: argparse.Namespace) -> int:
     summary = simulation.summary
     code = OK
     try:
-        with closing(warpfem.record(simulation, out)) as frames:
+        with _held_interrupt() as check_interrupt, closing(warpfem.record(simulation, out)) as frames:
             for _ in _progress(frames, scene.frames + 1) if say else frames:
-                pass
+                check_interrupt()
     except KeyboardInterrupt:
         code = _fail(SimulationError(f"interrupted: {_kept(summary, out)}"), FAILED)
     except WarpfemError as error:
