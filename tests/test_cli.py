@@ -206,7 +206,17 @@ def test_a_dt_above_the_limit_is_refused_before_anything_is_written(tmp_path, ca
 
 def test_a_killed_run_leaves_its_frames(tmp_path):
     out = tmp_path / "jelly.usdc"
-    command = [sys.executable, "-m", "warpfem", "run", str(SCENES / "jelly_drop.py"), "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "warpfem",
+        "run",
+        str(SCENES / "jelly_drop.py"),
+        "--out",
+        str(out),
+        "--frames",
+        "2000",
+    ]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     partial = tmp_path / "jelly.partial.usda"
     frames = 0
@@ -230,7 +240,17 @@ def test_a_killed_run_leaves_its_frames(tmp_path):
 
 def test_interrupt_ends_cleanly(tmp_path):
     out = tmp_path / "jelly.usdc"
-    command = [sys.executable, "-m", "warpfem", "run", str(SCENES / "jelly_drop.py"), "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "warpfem",
+        "run",
+        str(SCENES / "jelly_drop.py"),
+        "--out",
+        str(out),
+        "--frames",
+        "2000",
+    ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     partial = tmp_path / "jelly.partial.usda"
     while process.poll() is None and not (partial.is_file() and read_animation(partial).frame_count >= 2):
