@@ -164,26 +164,11 @@ class CellBlock:
             parameters,
         ]
 
-    def launch(self, name: str, inputs: list, outputs: list) -> None:
-        """Launches the kernel of that name over the cells."""
-        wp.launch(
-            getattr(self.kernels, name),
-            self.count,
-            inputs=[*self.arguments, *inputs],
-            outputs=outputs,
-            device=self.device,
-        )
-
-    def launch_stress(self, name: str, inputs: list, outputs: list) -> None:
-        """Launches a kernel that needs no volume."""
-        cells, inverse_shape, _, parameters = self.arguments
-        wp.launch(
-            getattr(self.kernels, name),
-            self.count,
-            inputs=[cells, inverse_shape, parameters, *inputs],
-            outputs=outputs,
-            device=self.device,
-        )
+    def launch(self, name: str, inputs: list, outputs: list, *, volume: bool = True) -> None:
+        """Launches the kernel of that name over the cells; ``volume`` is whether it takes their volumes."""
+        cells, inverse_shape, volumes, parameters = self.arguments
+        own = [cells, inverse_shape, volumes, parameters] if volume else [cells, inverse_shape, parameters]
+        wp.launch(getattr(self.kernels, name), self.count, inputs=[*own, *inputs], outputs=outputs, device=self.device)
 
 
 class Model:
@@ -346,7 +331,7 @@ class Model:
         psi = np.empty(self.cell_count)
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch_stress("density", [state.u], [out])
+            block.launch("density", [state.u], [out], volume=False)
             psi[block.index] = out.numpy()
         return psi
 
@@ -444,7 +429,7 @@ class Model:
         u = state.displacement
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=solid, device=self.device)
-            block.launch_stress("stress", [state.u], [out])
+            block.launch("stress", [state.u], [out], volume=False)
             P[block.index] = out.numpy()
             corners = u[block.host_cells]
             edges = corners[:, 1:] - corners[:, :1]
@@ -482,7 +467,7 @@ class Model:
         for block in self.blocks:
             J = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
             stress = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch_stress("diagnostics", [state.u], [J, stress])
+            block.launch("diagnostics", [state.u], [J, stress], volume=False)
             jacobian[block.index] = J.numpy()
             von_mises[block.index] = stress.numpy()
         return jacobian, von_mises
