@@ -164,11 +164,12 @@ class CellBlock:
             parameters,
         ]
 
-    def launch(self, name: str, inputs: list, outputs: list, *, volume: bool = True) -> None:
-        """Launches the kernel of that name over the cells; ``volume`` is whether it takes their volumes."""
-        cells, inverse_shape, volumes, parameters = self.arguments
-        own = [cells, inverse_shape, volumes, parameters] if volume else [cells, inverse_shape, parameters]
-        wp.launch(getattr(self.kernels, name), self.count, inputs=[*own, *inputs], outputs=outputs, device=self.device)
+    def launch(self, name: str, inputs: list, outputs: list) -> None:
+        """Launches the kernel of that name over the cells, with those of :attr:`arguments` that it names first."""
+        kernel = getattr(self.kernels, name)
+        known = dict(zip(("cells", "inverse_shape", "volume", "parameters"), self.arguments, strict=True))
+        own = [known[argument.label] for argument in kernel.adj.args if argument.label in known]
+        wp.launch(kernel, self.count, inputs=[*own, *inputs], outputs=outputs, device=self.device)
 
 
 class Model:
@@ -331,7 +332,7 @@ class Model:
         psi = np.empty(self.cell_count)
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch("density", [state.u], [out], volume=False)
+            block.launch("density", [state.u], [out])
             psi[block.index] = out.numpy()
         return psi
 
@@ -396,7 +397,7 @@ class Model:
 
         vectors = _point_vectors("the direction", direction, (self.point_count, self.dim))
         p = self._device_array(vectors, self.types.vector)
-        operator = tangent_operator(self, route, clamped=False, external=False)
+        operator = tangent_operator(self, route, external=False)
         operator.linearize(state.u, mass_weight=0.0)
         out = self.zeros()
         operator.apply(p, out)
@@ -429,7 +430,7 @@ class Model:
         u = state.displacement
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=solid, device=self.device)
-            block.launch("stress", [state.u], [out], volume=False)
+            block.launch("stress", [state.u], [out])
             P[block.index] = out.numpy()
             corners = u[block.host_cells]
             edges = corners[:, 1:] - corners[:, :1]
@@ -467,7 +468,7 @@ class Model:
         for block in self.blocks:
             J = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
             stress = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch("diagnostics", [state.u], [J, stress], volume=False)
+            block.launch("diagnostics", [state.u], [J, stress])
             jacobian[block.index] = J.numpy()
             von_mises[block.index] = stress.numpy()
         return jacobian, von_mises
