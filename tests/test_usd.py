@@ -499,7 +499,7 @@ def fail_to_move(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
             raise OSError("no space left")
         REPLACE(source, target)
 
-    monkeypatch.setattr("warpfem.usd.chunks.os.replace", replace)
+    monkeypatch.setattr("warpfem.files.os.replace", replace)
 
 
 REPLACE = os.replace
@@ -534,7 +534,7 @@ def test_a_failed_merge_keeps_the_old_output_the_frames_and_the_first_error(tmp_
             writer.write_frame([make_frame(body, 0)])
             raise RuntimeError("diverged")
     (note,) = caught.value.__notes__
-    assert f"cannot be written (the frames are in {tmp_path / 'run.partial.usda'})" in note
+    assert f"cannot be written (what was saved of its frames is in {tmp_path / 'run.partial.usda'})" in note
     assert_sound(path, 2)
     assert_sound(tmp_path / "run.partial.usda", 1)
     assert not (tmp_path / "run.partial" / "merged.usdc").exists()
@@ -614,7 +614,7 @@ def test_a_full_disk_loses_no_frames(tmp_path: Path) -> None:
     command = [sys.executable, "-c", code, str(tmp_path / "run.usdc")]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     *message, partial, complete = result.stdout.splitlines()
-    assert "cannot be written (the frames are in" in message[0] and "run.partial.usda" in message[0]
+    assert "cannot be written (what was saved of its frames is in" in message[0] and "run.partial.usda" in message[0]
     assert (partial, complete) == ("20", "20")
 
 
