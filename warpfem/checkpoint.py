@@ -178,8 +178,8 @@ def _body_parts(body: Body) -> Iterator[tuple[str, Any]]:
     yield "the density", body.density
     yield "the supports", [_support(body, support) for support in body.supports]
     yield "the loads", [_load(body, load) for load in body.loads]
-    yield "the initial displacement", body.initial_displacement()
-    yield "the initial velocity", body.initial_velocity()
+    yield "the initial displacement", None if body.displacement is None else body.initial_displacement()
+    yield "the initial velocity", None if body.velocity is None else body.initial_velocity()
 
 
 def _material(material: Material, cell_count: int) -> list:

@@ -276,8 +276,10 @@ def _kept(out: Path) -> str:
     """Says where the frames of a run that has ended early are."""
     from warpfem.usd import partial_path
 
-    path = partial_path(out) if partial_path(out).exists() else out
-    return f"{path} holds {_frames_in(path)}"
+    for path in (partial_path(out), out):
+        if path.exists():
+            return f"{path} holds {_frames_in(path)}"
+    return "no frame is left"
 
 
 def _progress(frames: Iterable[Frame], total: int) -> Iterator[Frame]:

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 from pxr import Sdf, Tf, Vt
 
+from warpfem.errors import OutputError
 from warpfem.files import beside, replacing, settle
 from warpfem.usd.prims import WORLD, set_clock
 from warpfem.usd.saved import Chunk, partial_path
@@ -59,7 +60,7 @@ class ChunkedLayer:
             kept: the first frames, of this file's predecessor or of a finished one.
 
         Raises:
-            OSError, Tf.ErrorException: the files cannot be written.
+            OSError, Tf.ErrorException, OutputError: the files cannot be written.
         """
         self._output = output
         self.path = partial_path(output)
@@ -100,7 +101,7 @@ class ChunkedLayer:
         """Saves the frames that wait.
 
         Raises:
-            OSError, Tf.ErrorException: the files cannot be written; the frames go on waiting.
+            OSError, Tf.ErrorException, OutputError: the files cannot be written; the frames go on waiting.
         """
         if not self._pending:
             return
@@ -125,7 +126,7 @@ class ChunkedLayer:
             amend: gives the samples to replace, from the samples of a frame.
 
         Raises:
-            OSError, Tf.ErrorException: the files cannot be written; the partial file stays.
+            OSError, Tf.ErrorException, OutputError: the files cannot be written; the partial file stays.
         """
         self.flush(metadata)
         self._require_folder()
@@ -214,7 +215,7 @@ class ChunkedLayer:
 
     def _require_folder(self) -> None:
         if not self._folder.is_dir():
-            raise FileNotFoundError(f"the folder {self._folder} has been removed, and the frames in it")
+            raise OutputError(f"{self._output} cannot be written: {self._folder} has been removed, with the frames in it")
 
     def _export(self, layer: Sdf.Layer, path: Path) -> None:
         self._require_folder()  # exporting would make it again

@@ -63,6 +63,8 @@ def saved_chunks(path: Path, frame_count: int, animated: Iterable[Sdf.Path]) -> 
         if found < frame_count:
             raise OutputError(f"{path} holds {found} of the {frame_count} frames")
         for chunk in chunks:
+            if not chunk.path.is_file():
+                raise OutputError(f"{path} lacks its part {chunk.path}")
             layer = chunk.open()
             for attribute in animated:
                 lacking = set(chunk.frames) - set(layer.ListTimeSamplesForPath(attribute))

@@ -127,7 +127,7 @@ class UsdWriter:
             raise OutputError(f"{where}: {len(frames)} bodies given, the file has {len(self._bodies)}")
         for body, frame in zip(self._bodies, frames, strict=True):
             body.check(frame, where)
-        with reporting(f"{self.path} cannot be written", OutputError):
+        with self._saving():
             self._layer.append(self._samples(frames, where), self._metadata())
 
     def flush(self) -> None:
@@ -136,7 +136,7 @@ class UsdWriter:
         Raises:
             OutputError: the disk takes no more.
         """
-        with reporting(f"{self.path} cannot be written", OutputError):
+        with self._saving():
             self._layer.flush(self._metadata())
 
     def close(self) -> Path:
@@ -149,8 +149,7 @@ class UsdWriter:
             OutputError: the file cannot be written; the partial one stays.
         """
         if not self._closed:
-            saved = f"what was saved of its frames is in {self._layer.path}"
-            with reporting(f"{self.path} cannot be written ({saved})", OutputError):
+            with self._saving():
                 self._layer.merge(self._metadata(), self._colors)
             self._closed = True
         return self.path
@@ -166,7 +165,12 @@ class UsdWriter:
         except OutputError as output_error:
             if error is None or kind is GeneratorExit:  # which nobody gets to see
                 raise
-            error.add_note(str(output_error))
+            if str(error) != str(output_error):
+                error.add_note(str(output_error))
+
+    def _saving(self) -> contextlib.AbstractContextManager[None]:
+        saved = f"what was saved of its frames is in {self._layer.path}"
+        return reporting(f"{self.path} cannot be written ({saved})", OutputError)
 
     def _find_kept(self, last: int, frames: Sequence[BodyFrame]) -> list[Chunk]:
         """The chunks with the frames up to ``last``, which must be equal to ``frames``; minds their colours."""
@@ -190,7 +194,7 @@ class UsdWriter:
                     attributes = [body.surface_attribute(self._quantity) for body in self._bodies]
                     self._see(*(layer.QueryTimeSample(attribute, frame) for attribute in attributes))
             return chunks
-        raise OutputError(f"{self.path}: the frames up to {last} are missing: {'; '.join(reasons)}")
+        raise OutputError(f"{self.path}: the frames up to {last} are missing: {'; '.join(reasons)}. Run it anew")
 
     def _check_room(self, rest: Samples, frame_count: int) -> None:
         """The partial file and the merged one are on the disk together at the end."""
