@@ -215,7 +215,9 @@ class ChunkedLayer:
 
     def _require_folder(self) -> None:
         if not self._folder.is_dir():
-            raise OutputError(f"{self._output} cannot be written: {self._folder} has been removed, with the frames in it")
+            raise OutputError(
+                f"{self._output} cannot be written: {self._folder} has been removed, with the frames in it"
+            )
 
     def _export(self, layer: Sdf.Layer, path: Path) -> None:
         self._require_folder()  # exporting would make it again
