@@ -356,7 +356,7 @@ def test_frames_that_are_missing_are_said_before_anything_is_changed(killed, tmp
     message = {
         "nothing": r"run\.usdc: there is no such file",
         "another run": r"run\.usdc is of another run: its .* differs in frame 3",
-        "a lost chunk": r"000000\.usdc",
+        "a lost chunk": r"run\.partial",
         "too few frames": r"run\.usdc holds 3 of the 4 frames",
     }[left]
     with pytest.raises(wf.OutputError, match=rf"the frames up to 3 are missing: .*{message}"):
@@ -505,7 +505,7 @@ def test_a_stopped_command_is_resumed(tmp_path: Path, number: int) -> None:
         assert not out.exists()
     else:
         assert process.returncode == FAILED
-        assert printed.startswith("warpfem: interrupted: ") and f"{out} holds {frame + 1} frames" in printed
+        assert printed.startswith("warpfem: interrupted: ") and f"{frame + 1} frames are in {out}" in printed
         assert read_animation(out).frame_count == frame + 1
         assert not partial_path(out).exists()
     total = str(frame + 6)
@@ -601,7 +601,7 @@ def test_what_a_killed_run_left_is_not_overwritten_unasked(killed: Path, scene_f
     before = contents(folder)
     assert main(arguments) == WRONG_USE
     printed = capsys.readouterr().err
-    assert f"{partial_path(out)} holds 4 frames of a run that was killed" in printed
+    assert f"4 frames are in {partial_path(out)}, of a run that was killed" in printed
     assert "use --resume" in printed and "--overwrite" in printed
     checkpoint = before.pop("run.checkpoint.npz")
     checkpoint_path(out).unlink()

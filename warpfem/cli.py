@@ -248,7 +248,7 @@ def _require_consent(out: Path) -> None:
     partial = partial_path(out)
     found = [f"{out} exists"] if out.exists() else []
     if partial.exists():
-        found.append(f"{partial} holds {_frames_in(partial)} of a run that was killed")
+        found.append(f"{_frames_in(partial)} in {partial}, of a run that was killed")
     if not found:
         return
     text = ", and ".join(found)
@@ -268,8 +268,8 @@ def _frames_in(path: Path) -> str:
     try:
         count = read_animation(path).frame_count
     except OutputError:
-        return "no frames that can be read"
-    return f"{count} frame{'' if count == 1 else 's'}"
+        return "no readable frames are"
+    return "1 frame is" if count == 1 else f"{count} frames are"
 
 
 def _kept(out: Path) -> str:
@@ -278,7 +278,7 @@ def _kept(out: Path) -> str:
 
     for path in (partial_path(out), out):
         if path.exists():
-            return f"{path} holds {_frames_in(path)}"
+            return f"{_frames_in(path)} in {path}"
     return "no frame is left"
 
 

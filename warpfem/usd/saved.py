@@ -11,8 +11,9 @@ from pxr import Sdf
 
 from warpfem.errors import OutputError
 from warpfem.files import beside
+from warpfem.usd.animation import read_animation
 from warpfem.usd.prims import WORLD
-from warpfem.usd.stages import open_stage, reporting
+from warpfem.usd.stages import reporting
 
 
 def partial_path(output: str | Path) -> Path:
@@ -52,7 +53,7 @@ def saved_chunks(path: Path, frame_count: int, animated: Iterable[Sdf.Path]) -> 
     Raises:
         OutputError: the file is missing, unreadable, or lacks some of the frames.
     """
-    open_stage(path, OutputError)
+    read_animation(path)  # which finds damage that the library does not bear
     with reporting(f"{path} cannot be read", OutputError):
         root = Sdf.Layer.OpenAsAnonymous(str(path))
         chunks = [
