@@ -368,6 +368,8 @@ def test_a_run_that_is_not_resumed_replaces_what_was_left(killed: Path, tmp_path
     shutil.copytree(killed.parent, tmp_path, dirs_exist_ok=True)
     out = tmp_path / killed.name
     failure_path(out).write_text("an old one")
+    for name in ("run.checkpoint.npz", "run.partial.usda", "run.failed.npz"):
+        (tmp_path / f"writing.{name}").write_text("left by a kill in the middle of writing")
     assert_same(finish(pushed_block(), out), out, *reference)
     assert [path.name for path in tmp_path.iterdir()] == ["run.usdc"]
 

@@ -15,6 +15,10 @@ def beside(output: Path, ending: str) -> Path:
     return output.with_name(f"{output.stem}.{ending}")
 
 
+def _temporary(path: Path) -> Path:
+    return path.with_name(f"writing.{path.name}")
+
+
 def settle(temporary: Path, path: Path) -> None:
     """Moves a complete file to where it belongs, at one stroke, once it is on the disk for good.
 
@@ -35,12 +39,22 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written out or moved.
     """
-    temporary = path.with_name(f"writing.{path.name}")
+    temporary = _temporary(path)
     try:
         yield temporary
         settle(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Removes a file if there is one, and what a kill in the middle of writing it left.
+
+    Raises:
+        OSError: it cannot be removed.
+    """
+    path.unlink(missing_ok=True)
+    _temporary(path).unlink(missing_ok=True)
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

@@ -12,6 +12,7 @@ from warpfem.checkpoint import Checkpoint, checkpoint_path, scene_parts
 from warpfem.dtypes import FloatName
 from warpfem.errors import OutputError, SimulationError
 from warpfem.failure import failure_path, save_failure
+from warpfem.files import remove
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary, body_slices
 
@@ -162,6 +163,6 @@ def _failure_saved(simulation: Simulation, path: Path) -> Iterator[None]:
 
 def _remove(path: Path) -> None:
     try:
-        path.unlink(missing_ok=True)
+        remove(path)
     except OSError as error:
         raise OutputError(f"{path} cannot be removed: {error}") from error

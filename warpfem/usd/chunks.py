@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from pxr import Sdf, Tf, Vt
 
 from warpfem.errors import OutputError
-from warpfem.files import beside, replacing, settle
+from warpfem.files import beside, remove, replacing, settle
 from warpfem.usd.prims import WORLD, set_clock
 from warpfem.usd.saved import Chunk, partial_path
 
@@ -187,7 +187,7 @@ class ChunkedLayer:
         Sdf.CreatePrimInLayer(layer, WORLD).SetInfo("customData", metadata)
 
     def _remove(self) -> None:
-        self.path.unlink(missing_ok=True)
+        remove(self.path)
         if self._folder.exists():
             shutil.rmtree(self._folder)
 
