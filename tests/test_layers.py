@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "warpfem"
 
 LAYERS = [
     {"errors"},
-    {"tensor", "dtypes", "boundary", "moduli", "profiling"},
+    {"tensor", "dtypes", "boundary", "moduli", "profiling", "child"},
     {"mesh", "points"},
     {"materials"},
     {"elements", "meshing"},

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 from pxr import Sdf, Vt
 
 from warpfem.usd.prims import WORLD, set_clock
+from warpfem.usd.stages import trust
 
 Samples: TypeAlias = dict[Sdf.Path, Any]
 
@@ -165,6 +166,7 @@ class ChunkedLayer:
             }
             root.GetPrimAtPath(WORLD).SetInfo("clips", {"default": clips})
         _export(root, self.path)
+        trust(self.path, map(str, self._folder.glob("*.usdc")))
 
     def _describe(self, layer: Sdf.Layer, metadata: dict[str, Any]) -> None:
         set_clock(layer, self._static.framesPerSecond, self.frame_count)

@@ -19,7 +19,7 @@ from warpfem.usd.chunks import ChunkedLayer, Samples
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.obstacles import define_obstacles
 from warpfem.usd.prims import POINT_PRIMVARS, BodyPrims, define_world, prim_names
-from warpfem.usd.stages import reporting
+from warpfem.usd.stages import reporting, trust
 
 SUFFIXES = (".usdc", ".usd", ".usda")
 
@@ -127,6 +127,7 @@ class UsdWriter:
             saved = f"the frames are in {self._layer.path}"
             with reporting(f"{self.path} cannot be written ({saved})", OutputError):
                 self._layer.merge(self._metadata(), self._colors)
+            trust(self.path)
             self._closed = True
         return self.path
 
