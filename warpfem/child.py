@@ -19,14 +19,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from warpfem.errors import WarpfemError
+from warpfem.errors import WarpfemError, described
 
 T = TypeVar("T")
 
-MIN_SECONDS = 60.0
+MIN_SECONDS = 30.0
 """The least time that a child may take."""
 SECONDS_PER_BYTE = 5e-6
 """Time allowed per byte of the file: some text formats are read at a megabyte per second."""
+
+DAMAGED = "the file is damaged, cut short or of an unknown format: write it again"
 
 # What starts the child: this package without its __init__, which would import Warp.
 _START = """
@@ -50,10 +52,12 @@ def read_in_child(read: Callable[[str], T], path: str | os.PathLike[str], error:
         path: the file, and what messages name.
         error: raised if the child dies, takes too long or raises anything but a :class:`WarpfemError`.
     """
+    if not os.path.isfile(path):
+        raise error(f"{path}: there is no such file")
     seconds = MIN_SECONDS + SECONDS_PER_BYTE * _size(Path(path))
     answer, status = _ask(read, path, seconds, error)
     if not answer:
-        raise error(f"{path}: {_DAMAGED} (reading it {_ending(status, seconds)})")
+        raise error(f"{path}: {DAMAGED} (reading it {_ending(status, seconds)})")
     kind, value, remarks = pickle.loads(answer)
     for remark in remarks:
         warnings.warn(remark, stacklevel=4)
@@ -61,10 +65,7 @@ def read_in_child(read: Callable[[str], T], path: str | os.PathLike[str], error:
         return value
     if kind == "error":
         raise value
-    raise error(f"{path}: {_DAMAGED} ({value})")
-
-
-_DAMAGED = "the file is damaged, cut short or of an unknown format: write it again"
+    raise error(f"{path}: {DAMAGED} ({value})")
 
 
 def _size(path: Path) -> int:
@@ -92,7 +93,12 @@ def _ask(
         raise error(f"{path}: no process could be started to read it: {problem}") from problem
     assert process.stdout is not None
     late = threading.Event()
-    timer = threading.Timer(seconds, lambda: (late.set(), process.kill()))
+
+    def end() -> None:
+        late.set()
+        process.kill()
+
+    timer = threading.Timer(seconds, end)
     timer.daemon = True
     with process:
         try:
@@ -118,7 +124,7 @@ def serve(module: str, function: str, path: str, seconds: float) -> NoReturn:
     """Calls a function with the path, writes its answer to the standard output, and exits."""
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # libraries print what they like
-    _limit(seconds)
+    limit_resources(seconds)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with warnings.catch_warnings(record=True) as remarks:
         warnings.simplefilter("always")
@@ -128,14 +134,14 @@ def serve(module: str, function: str, path: str, seconds: float) -> NoReturn:
         except WarpfemError as error:
             reply = "error", error
         except BaseException as error:  # whatever a library raises on a damaged file
-            reply = "damaged", f"{type(error).__name__}: {error}"
+            reply = "damaged", described(error)
     said = list(dict.fromkeys(str(remark.message) for remark in remarks if remark.category is UserWarning))
     pickle.dump((*reply, said), answer, protocol=5)
     answer.close()
     os._exit(0)  # destructors have nothing to save, and may crash
 
 
-def _limit(seconds: float) -> None:
+def limit_resources(seconds: float) -> None:
     """Limits memory and processor time, and writes no core file, where the system knows such limits."""
     try:
         import resource

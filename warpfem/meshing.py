@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from warpfem.child import read_in_child
-from warpfem.errors import MeshError, MissingExtraError
+from warpfem.child import DAMAGED, read_in_child
+from warpfem.errors import MeshError, MissingExtraError, described, one_line
 from warpfem.mesh import Mesh, _array, _check_references
 
 _USD = {".usd", ".usda", ".usdc", ".usdz"}
@@ -36,6 +36,7 @@ _MARKS = {
     ".mdpa": rb"^\s*End \w+\s*\Z",
     ".ply": rb"^end_header\s",
     ".off": rb"^\s*\d+\s+\d+\s+\d+\s",
+    ".stl": rb"\A(?!solid)|^\s*endsolid",  # text starts with the word
 }
 
 MAX_CLOSED_AREA_RATIO = 1.1
@@ -170,8 +171,8 @@ def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float
 
 def _existing(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
-    if not path.is_file():
-        raise MeshError(f"{path}: {'is a directory, not a file' if path.is_dir() else 'no such file'}")
+    if not os.path.isfile(path):  # unlike the path's own method it bears any name
+        raise MeshError(f"{path}: {'is a directory, not a file' if os.path.isdir(path) else 'no such file'}")
     return path
 
 
@@ -218,9 +219,9 @@ def _read_file(path: Path) -> Any:
         with redirect_stdout(printed), redirect_stderr(printed):
             file = meshio.read(path)
     except (Exception, SystemExit) as error:  # meshio raises anything on damaged files, and may exit
-        reason = " ".join(printed.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise MeshError(f"the file is damaged, cut short or of an unknown format ({reason})") from error
-    if remarks := " ".join(printed.getvalue().split()):
+        reason = one_line(printed.getvalue()) or described(error)
+        raise MeshError(f"{DAMAGED} ({reason})") from error
+    if remarks := one_line(printed.getvalue()):
         warnings.warn(f"{path}: meshio says: {remarks}", stacklevel=3)
     return file
 

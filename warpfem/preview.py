@@ -99,9 +99,9 @@ def preview(path: str | Path, out: str | Path, *, frames: int | None = None) -> 
 def _check_settings(out: Path, frames: int | None) -> None:
     if out.suffix not in MOST_FRAMES:
         raise OutputError(f"{out}: the name of a preview must end in {' or '.join(MOST_FRAMES)}")
-    if out.is_dir():
+    if os.path.isdir(out):
         raise OutputError(f"{out} is a folder: give the name of a file")
-    if not os.access(out if out.exists() else out.parent, os.W_OK):
+    if not os.access(out if os.path.exists(out) else out.parent, os.W_OK):
         raise OutputError(f"{out} cannot be written: its folder does not exist, or writing is not permitted")
     if frames is not None and frames < 1:
         raise OutputError(f"{out}: a preview has at least 1 frame, not {frames}")

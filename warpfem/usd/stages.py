@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
-from warpfem.errors import WarpfemError
+from warpfem.errors import WarpfemError, one_line
 
 Stamp: TypeAlias = tuple[int, int, int]
 
@@ -27,8 +27,8 @@ def reporting(what: str, error: type[WarpfemError]) -> Iterator[None]:
     except WarpfemError:
         raise
     except Tf.ErrorException as problem:
-        reasons = [item.commentary.strip() for item in problem.args]
-        raise error(f"{what}: {'; '.join(reasons)}") from problem
+        reasons = "; ".join(item.commentary.strip() for item in problem.args)
+        raise error(f"{what}: {one_line(reasons)}") from problem
     except OSError as problem:
         raise error(f"{what}: {problem}") from problem
 
@@ -41,7 +41,7 @@ def open_stage(path: str | Path, error: type[WarpfemError]) -> Usd.Stage:
     Raises:
         error: the file is missing, or not readable as USD.
     """
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise error(f"{path}: there is no such file")
     with reporting(f"{path} cannot be read as USD", error):
         layer = Sdf.Layer.FindOrOpen(str(path))
