@@ -52,9 +52,8 @@ def read_in_child(read: Callable[[str], T], path: str | os.PathLike[str], error:
         path: the file, and what messages name.
         error: raised if the child dies, takes too long or raises anything but a :class:`WarpfemError`.
     """
-    if not os.path.isfile(path):
-        raise error(f"{path}: there is no such file")
-    seconds = MIN_SECONDS + SECONDS_PER_BYTE * _size(Path(path))
+    path = existing(path, error)
+    seconds = MIN_SECONDS + SECONDS_PER_BYTE * _size(path)
     answer, status = _ask(read, path, seconds, error)
     if not answer:
         raise error(f"{path}: {DAMAGED} (reading it {_ending(status, seconds)})")
@@ -66,6 +65,19 @@ def read_in_child(read: Callable[[str], T], path: str | os.PathLike[str], error:
     if kind == "error":
         raise value
     raise error(f"{path}: {DAMAGED} ({value})")
+
+
+def existing(path: object, error: type[WarpfemError]) -> Path:
+    """The path of a file, if there is one.
+
+    Raises:
+        error: the name is none, or belongs to no file.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise error(f"the name of a file must be a str or a path, not {path!r}")
+    if not os.path.isfile(path):  # unlike the path's own method it bears any name
+        raise error(f"{path}: {'is a directory, not a file' if os.path.isdir(path) else 'no such file'}")
+    return Path(path)
 
 
 def _size(path: Path) -> int:

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from warpfem.child import DAMAGED, read_in_child
+from warpfem.boundary import is_number
+from warpfem.child import DAMAGED, existing, read_in_child
 from warpfem.errors import MeshError, MissingExtraError, described, one_line
 from warpfem.mesh import Mesh, _array, _check_references
 
@@ -62,7 +63,7 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
             mesh cannot be simulated; triangles off the plane are a surface, for :func:`tetrahedralize`.
         MissingExtraError: meshio is not installed.
     """
-    path = _existing(path)
+    path = existing(path, MeshError)
     if path.suffix.lower() in _USD:
         from warpfem.usd import read_tet_mesh
 
@@ -89,7 +90,7 @@ def read_surface(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         MeshError: the file is missing, damaged or of an unknown format, or has no faces.
         MissingExtraError: meshio is not installed.
     """
-    path = _existing(path)
+    path = existing(path, MeshError)
     if path.suffix.lower() in _USD:
         from warpfem.usd import read_surface_mesh
 
@@ -134,7 +135,7 @@ def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float
         raise MeshError("the surface is flat and encloses no volume: give the closed surface of a solid")
     if edge_length is None:
         edge_length = diagonal / 20.0
-    if not 0.0 < edge_length <= diagonal:
+    if not is_number(edge_length) or not 0.0 < edge_length <= diagonal:
         raise MeshError(
             f"edge_length must be above 0 and at most the diagonal of the surface's bounding box, "
             f"{diagonal:g} m, not {edge_length!r}"
@@ -167,13 +168,6 @@ def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float
 
 
 # ---- files
-
-
-def _existing(path: str | os.PathLike[str]) -> Path:
-    path = Path(path)
-    if not os.path.isfile(path):  # unlike the path's own method it bears any name
-        raise MeshError(f"{path}: {'is a directory, not a file' if os.path.isdir(path) else 'no such file'}")
-    return path
 
 
 @contextmanager

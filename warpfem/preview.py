@@ -76,6 +76,8 @@ def preview(path: str | Path, out: str | Path, *, frames: int | None = None) -> 
             missing, not an animation, or has no frames.
         MissingExtraError: Matplotlib or Pillow is not installed.
     """
+    if not isinstance(out, str | os.PathLike):
+        raise OutputError(f"the name of a preview must be a str or a path, not {out!r}")
     out = Path(out)
     _check_settings(out, frames)
     try:
@@ -103,8 +105,8 @@ def _check_settings(out: Path, frames: int | None) -> None:
         raise OutputError(f"{out} is a folder: give the name of a file")
     if not os.access(out if os.path.exists(out) else out.parent, os.W_OK):
         raise OutputError(f"{out} cannot be written: its folder does not exist, or writing is not permitted")
-    if frames is not None and frames < 1:
-        raise OutputError(f"{out}: a preview has at least 1 frame, not {frames}")
+    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, int) or frames < 1):
+        raise OutputError(f"{out}: a preview has at least 1 frame, not {frames!r}")
 
 
 # ---- the two kinds of pictures

@@ -390,9 +390,9 @@ class BackwardEuler(Solver):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise SceneError(f"BackwardEuler: {name} must be an integer >= 1, not {value!r}")
-        if self.hessian not in ("clamped", "exact"):
+        if not isinstance(self.hessian, str) or self.hessian not in ("clamped", "exact"):
             raise SceneError(f"BackwardEuler: hessian must be 'clamped' or 'exact', not {self.hessian!r}")
-        if self.differential not in ("assembled", "closed", "tape"):
+        if not isinstance(self.differential, str) or self.differential not in ("assembled", "closed", "tape"):
             raise SceneError(
                 f"BackwardEuler: differential must be 'assembled', 'closed' or 'tape', not {self.differential!r}"
             )

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from warpfem.child import read_in_child
+from warpfem.child import existing, read_in_child
 from warpfem.errors import MeshError, OutputError
 from warpfem.usd.colors import ColorScale
 from warpfem.usd.meshes import triangles_of
@@ -188,6 +188,7 @@ def read_animation(path: str | Path) -> Animation:
     Raises:
         OutputError: a file that is missing, unreadable, damaged or not of this kind.
     """
+    path = existing(path, OutputError)
     if not is_trusted(path):
         trust(path, read_in_child(read_through, path, OutputError))
     return Animation(path)

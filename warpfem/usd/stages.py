@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
+from warpfem.child import existing
 from warpfem.errors import WarpfemError, one_line
 
 Stamp: TypeAlias = tuple[int, int, int]
@@ -41,8 +42,7 @@ def open_stage(path: str | Path, error: type[WarpfemError]) -> Usd.Stage:
     Raises:
         error: the file is missing, or not readable as USD.
     """
-    if not os.path.isfile(path):
-        raise error(f"{path}: there is no such file")
+    existing(path, error)
     with reporting(f"{path} cannot be read as USD", error):
         layer = Sdf.Layer.FindOrOpen(str(path))
         layer.Reload()
