@@ -459,7 +459,7 @@ def tangent_operator(model: Model, route: Route, *, external: bool = True) -> Ta
         external: whether contact and supports are part of it.
     """
     operators = {"assembled": AssembledOperator, "closed": ClosedFormOperator, "tape": TapeOperator}
-    if route not in operators:
+    if not isinstance(route, str) or route not in operators:
         raise SimulationError(f"route must be one of {', '.join(map(repr, operators))}, not {route!r}")
     return operators[route](model, external)
 

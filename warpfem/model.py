@@ -205,10 +205,10 @@ class Model:
         self.scene = scene
         self.dtype = dtype
         self.dim = scene.dim
-        self.types = types(scene.dim, dtype)
+        self.types = types(scene.dim, str(dtype))
         try:
             self.device = wp.get_device(device)
-        except (RuntimeError, ValueError) as error:
+        except (RuntimeError, ValueError, TypeError) as error:
             known = ", ".join(str(known.alias) for known in wp.get_devices())
             raise SceneError(f"no device '{device}': there is {known}") from error
         meshes = [body.mesh for body in scene.bodies]
@@ -487,7 +487,7 @@ class Model:
 def _point_vectors(what: str, value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SimulationError(f"{what} must be numbers of shape {shape}, not {value!r}") from None
     if array.shape != shape:
         raise SimulationError(f"{what} must have shape {shape} for this model, not {array.shape}")

@@ -470,14 +470,15 @@ class BackwardEuler(Solver):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise SceneError(f"BackwardEuler: {name} must be an integer >= 1, not {value!r}")
-        if self.hessian not in ("absolute", "clamped", "exact"):
-            raise SceneError(f"BackwardEuler: hessian must be 'absolute', 'clamped' or 'exact', not {self.hessian!r}")
-        if self.unconverged not in ("halve", "accept"):
-            raise SceneError(f"BackwardEuler: unconverged must be 'halve' or 'accept', not {self.unconverged!r}")
-        if self.differential not in ("assembled", "closed", "tape"):
-            raise SceneError(
-                f"BackwardEuler: differential must be 'assembled', 'closed' or 'tape', not {self.differential!r}"
-            )
+        for name, choices in (
+            ("hessian", ("absolute", "clamped", "exact")),
+            ("unconverged", ("halve", "accept")),
+            ("differential", ("assembled", "closed", "tape")),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in choices:
+                listed = f"{', '.join(map(repr, choices[:-1]))} or {choices[-1]!r}"
+                raise SceneError(f"BackwardEuler: {name} must be {listed}, not {value!r}")
         if self.differential == "tape" and self.hessian != "exact":
             raise SceneError("BackwardEuler: the tape cannot filter eigenvalues: take hessian='exact'")
 
