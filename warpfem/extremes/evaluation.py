@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
-from warpfem.extremes.subjects import DTYPES, EPSILON, custom, hookean, label, model_of, rotation, slab
+from warpfem.boundary import Pin, Plane, Sphere
+from warpfem.dtypes import FloatName
+from warpfem.extremes.subjects import DTYPES, EPSILON, custom, frugal, hookean, label, model_of, rotation, slab
 from warpfem.extremes.table import Trial, at_most, case
-from warpfem.materials import LinearElasticity
+from warpfem.materials import HookeanMaterial, LinearElasticity, Material
+from warpfem.mesh import Mesh
+from warpfem.moduli import elastic_moduli
+from warpfem.scene import Body, Scene
+from warpfem.simulation import Simulation
+from warpfem.solvers import BackwardEuler, Solver, SymplecticEuler, VelocityVerlet
 
 E, NU = 1e5, 0.3
 
@@ -50,3 +60,201 @@ def rigid_motion(quick: bool) -> Iterator[Trial]:
                 change = forces(noise + shift) - forces(noise)
                 worst = np.linalg.norm(change, axis=1).max()
                 yield at_most(label(material, dim, dtype, "deformed and translated"), worst, limit * 1e6 * length, " N")
+
+
+@case(
+    2,
+    "strain of 1e-7",
+    "Of cells with random displacement gradients H of size 1e-7, the stress P, the forces on the points and the energy "
+    "density in float32 differ from those in float64 of the same H by less than 1e-5 of their size; those in float64 "
+    "from Hooke's law, evaluated in NumPy, by less than 1e-5 of (lam + 2 mu) |H|. (The energy of a user's own psi(F) "
+    "is not compared: psi near F = I cancels by itself. Its stress is.)",
+)
+def small_strain(quick: bool) -> Iterator[Trial]:
+    rng = np.random.default_rng(2)
+    for dim in (2, 3):
+        mesh = slab(dim)
+        noise = 1e-7 * mesh.edge_lengths.min() * rng.normal(size=mesh.points.shape)
+        for nu in (NU,) if quick else (0.0, NU, 0.45, 0.495):
+            moduli = elastic_moduli(E=E, nu=nu)
+            for material in hookean(E, nu) if quick else [*hookean(E, nu), custom(E, nu)]:
+                single, double = (model_of(material, mesh, dtype) for dtype in DTYPES)
+                state, same = single.state(), double.state()
+                state.assign(displacement=noise)
+                same.assign(displacement=state.displacement)
+                errors = {
+                    "P": relative_error(
+                        single.stresses(state).first_piola_kirchhoff, double.stresses(same).first_piola_kirchhoff
+                    ),
+                    "force": relative_error(single.internal_force(state), double.internal_force(same)),
+                }
+                H = displacement_gradients(mesh, same.displacement)
+                P = moduli.mu * (H + H.transpose(0, 2, 1))
+                P += moduli.lam * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+                difference = np.linalg.norm(double.stresses(same).first_piola_kirchhoff - P, axis=(1, 2))
+                hooke = {"P": np.max(difference / (moduli.p_wave * np.linalg.norm(H, axis=(1, 2))))}
+                if isinstance(material, HookeanMaterial):
+                    energy = double.energy_densities(same)
+                    errors["energy"] = relative_error(single.energy_densities(state), energy)
+                    difference = np.abs(energy - 0.5 * np.einsum("cij,cij->c", P, H))
+                    hooke["energy"] = np.max(difference / (moduli.p_wave * np.sum(H * H, axis=(1, 2))))
+                for name, error in errors.items():
+                    yield at_most(label(material, dim, f"nu = {nu:g}", name, "float32"), error, 1e-5)
+                for name, error in hooke.items():
+                    yield at_most(label(material, dim, f"nu = {nu:g}", name, "float64, Hooke"), error, 1e-5)
+
+
+def displacement_gradients(mesh: Mesh, displacement: np.ndarray) -> np.ndarray:
+    """H of every cell, (cell_count, 3, 3)."""
+    corners = displacement[mesh.cells]
+    H = np.zeros((mesh.cell_count, 3, 3))
+    d = mesh.dim
+    H[:, :d, :d] = np.einsum("cki,ckj->cij", corners[:, 1:] - corners[:, :1], mesh.inverse_shape_matrices)
+    return H
+
+
+def relative_error(actual: np.ndarray, expected: np.ndarray) -> float:
+    """The largest |actual - expected| over |expected| of any entry of the first axis."""
+    axes = tuple(range(1, expected.ndim))
+    difference, size = np.sum((actual - expected) ** 2, axis=axes), np.sum(expected**2, axis=axes)
+    return float(np.sqrt(np.max(difference / size)))
+
+
+# ---- trajectories
+
+
+def thrown(
+    mesh: Mesh, material: Material, solver: Solver, *, length: float = 1.0, stiffness: float = E, density: float = 1e3
+) -> Scene:
+    """A slab, pinned on the left, that swings onto a floor and a ball, both rough, and back.
+
+    Args:
+        mesh: a :func:`slab`, perhaps moved, times ``length``.
+        material: of Young's modulus ``stiffness``.
+        solver: the solver.
+        length: the unit of length [m]. Speed, gravity and time follow from it and from the speed of waves.
+        stiffness: [Pa].
+        density: [kg/m^3].
+    """
+    speed = np.sqrt(stiffness / density)
+    right, up = np.eye(mesh.dim)[:2]
+    corner = mesh.bounding_box[0]
+    below = corner + length * np.array([2.0, -0.28125, 0.5])[: mesh.dim]  # of binary fractions: exact also far away
+
+    def velocity(x: np.ndarray) -> np.ndarray:
+        return -0.1 * speed * np.outer((x - corner) @ right / length, up)
+
+    return Scene(
+        [Body("slab", mesh, material, density, supports=[Pin("left")], velocity=velocity)],
+        solver,
+        dt=(0.05 if isinstance(solver, BackwardEuler) else 0.01) * length / speed,
+        gravity=-0.01 * speed**2 / length * up,
+        obstacles=[
+            Plane(corner - 0.0625 * length * up, up, friction=0.5),
+            Sphere(below, 0.25 * length, friction=0.5),
+        ],
+        damping=0.1 * speed / length,
+        fps=2.0 * speed / length,
+        frames=8,
+    )
+
+
+def trajectory(scene: Scene, dtype: FloatName) -> np.ndarray:
+    """The displacements of all frames, (frames, point_count, dim) [m]."""
+    return np.stack([frame.displacement for frame in Simulation(scene, device="cpu", dtype=dtype).frames()])
+
+
+def settings(quick: bool) -> Iterator[tuple[int, Material, Solver, FloatName]]:
+    """What trajectories are run with."""
+    implicit, explicit = BackwardEuler(), VelocityVerlet()
+    if quick:
+        for dim in (2, 3):
+            yield dim, frugal(dim, E, NU), implicit, "float64" if dim == 2 else "float32"
+            yield dim, frugal(dim, E, NU), explicit, "float32" if dim == 2 else "float64"
+        return
+    for dim in (2, 3):
+        for dtype in DTYPES:
+            for material in hookean(E, NU):
+                yield dim, material, implicit, dtype
+                yield dim, material, explicit, dtype
+            yield dim, frugal(dim, E, NU), BackwardEuler.linearised(), dtype
+            yield dim, frugal(dim, E, NU), SymplecticEuler(), dtype
+
+
+def solver_name(solver: Solver) -> str:
+    """How trials call a solver."""
+    linearised = isinstance(solver, BackwardEuler) and solver.max_iterations == 1
+    return f"{type(solver).__name__}{'.linearised' if linearised else ''}"
+
+
+@case(
+    3,
+    "rest shape 1e6 lengths from the origin",
+    "A body that swings onto a floor and a ball with friction has the same displacements, bit for bit, when the whole "
+    "scene is moved by 1e6 body lengths along every axis, if its coordinates are exact there. If they are not, because "
+    "the points are irregular, the displacements change by less than 1000 times what a point is rounded by.",
+)
+def far_away(quick: bool) -> Iterator[Trial]:
+    far = 2e6  # the slab is 2 m long
+    rng = np.random.default_rng(3)
+    for dim, material, solver, dtype in settings(quick):
+        mesh = slab(dim)
+        near = trajectory(thrown(mesh, material, solver), dtype)
+        moved = trajectory(thrown(mesh.transformed(offset=(far,) * dim), material, solver), dtype)
+        name = label(material, dim, dtype, solver_name(solver))
+        yield at_most(f"{name}, exact", np.abs(moved - near).max(), 0.0, " m")
+        irregular = Mesh(mesh.points + 0.05 * rng.uniform(-1.0, 1.0, mesh.points.shape), mesh.cells, mesh.point_sets)
+        near = trajectory(thrown(irregular, material, solver), dtype)
+        moved = trajectory(thrown(irregular.transformed(offset=(far,) * dim), material, solver), dtype)
+        rounding = max(EPSILON[dtype], far * EPSILON["float64"])
+        yield at_most(f"{name}, irregular", np.abs(moved - near).max(), 1e3 * rounding, " m")
+
+
+@case(
+    4,
+    "units from 1e-6 to 1e3 m",
+    "A body that swings onto a floor and a ball with friction has the same displacements in body lengths if it is "
+    "1e-6, 1e-3 or 1e3 times as large, with time and gravity in proportion, and if the same body is described in units of "
+    "1e-6, 1e-3 or 1e3 m: to 1e-4 L in float32, 1e-9 L in float64.",
+)
+def units(quick: bool) -> Iterator[Trial]:
+    scales = (1e-6,) if quick else (1e-6, 1e-3, 1e3)
+    for dim, material, solver, dtype in settings(quick):
+        expected = trajectory(thrown(slab(dim), material, solver), dtype)
+        limit = {"float32": 1e-4, "float64": 1e-9}[dtype]
+        for scale in scales:
+            name = label(material, dim, dtype, solver_name(solver))
+            scene = thrown(slab(dim).transformed(scale), material, solver, length=scale)
+            difference = np.abs(trajectory(scene, dtype) / scale - expected).max()
+            yield at_most(f"{name}, {scale:g} times as large", difference, limit, " L")
+            other = replace(material, E=E * scale, nu=NU, K=None, lam=None, mu=None)
+            scene = thrown(
+                slab(dim).transformed(1.0 / scale),
+                other,
+                solver,
+                length=1.0 / scale,
+                stiffness=E * scale,
+                density=1e3 * scale**3,
+            )
+            difference = np.abs(trajectory(scene, dtype) * scale - expected).max()
+            yield at_most(f"{name}, unit {scale:g} m", difference, limit, " L")
+
+
+@case(
+    22,
+    "the same run twice",
+    "Two runs of the same scene, with contact and friction, give the same bits on the CPU: in one process in the quick form, in two in the full one.",
+)
+def same_bits(quick: bool) -> Iterator[Trial]:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawn) as other_process:
+        for setting in settings(quick):
+            first = _run_thrown(*setting)
+            second = _run_thrown(*setting) if quick else other_process.submit(_run_thrown, *setting).result()
+            dim, material, solver, dtype = setting
+            different = float(np.sum(first != second))
+            yield at_most(label(material, dim, dtype, solver_name(solver)), different, 0.0, " numbers differ")
+
+
+def _run_thrown(dim: int, material: Material, solver: Solver, dtype: FloatName) -> np.ndarray:
+    return trajectory(thrown(slab(dim), material, solver), dtype)
