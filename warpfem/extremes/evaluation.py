@@ -311,7 +311,7 @@ def trajectory(scene: Scene, dtype: FloatName) -> np.ndarray:
     return np.stack([frame.displacement for frame in Simulation(scene, device="cpu", dtype=dtype).frames()])
 
 
-def settings(quick: bool) -> Iterator[tuple[int, Material, Solver, FloatName]]:
+def settings(quick: bool) -> Iterator[tuple[int, HookeanMaterial, Solver, FloatName]]:
     """What trajectories are run with."""
     implicit, explicit = BackwardEuler(), VelocityVerlet()
     if quick:

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import FloatName
-from warpfem.materials import MATERIALS, EnergyMaterial, LinearElasticity, Material, StableNeoHookean
+from warpfem.materials import MATERIALS, EnergyMaterial, HookeanMaterial, LinearElasticity, Material, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.model import Model
 from warpfem.moduli import elastic_moduli
@@ -32,12 +32,12 @@ def custom(E: float, nu: float) -> EnergyMaterial:
     return EnergyMaterial(two_term_energy, {"mu": moduli.mu, "lam": moduli.lam})
 
 
-def hookean(E: float, nu: float) -> list[Material]:
+def hookean(E: float, nu: float) -> list[HookeanMaterial]:
     """The materials that E and nu determine."""
     return [kind(E=E, nu=nu) for kind in MATERIALS.values()]
 
 
-def frugal(dim: int, E: float, nu: float) -> Material:
+def frugal(dim: int, E: float, nu: float) -> HookeanMaterial:
     """The material of that dimension that quick forms take, so that few kernels are compiled."""
     return LinearElasticity(E=E, nu=nu) if dim == 2 else StableNeoHookean(E=E, nu=nu)
 
