@@ -274,6 +274,19 @@ def test_collapsed_cells_stay_finite(name, dim):
         assert eigenvalues.max() < 30.0 * E  # also where s_i + s_j = 0 and the exact one has no bound
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@dims
+def test_neo_hookean_under_extreme_compression(dim, dtype):
+    """Squashed to 1e-3: J = 1e-6 or 1e-9, of which J - 1 keeps few digits or none."""
+    material = NeoHookean(E=1.0, nu=0.3)
+    F = 1e-3 * np.eye(dim)[None]
+    samples, expected = Samples(material, F, dtype), ReferenceSamples(material, F)
+    resolved = 20.0 * samples.model.types.epsilon / 1e-3  # H is stored, and F is I + H
+    assert relative_error(samples.energy_density, expected.energy_density) <= resolved
+    assert relative_error(samples.stress, expected.stress) <= resolved
+    assert relative_error(samples.tangent, expected.tangent) <= resolved
+
+
 @dims
 def test_neo_hookean_ends_at_collapse(dim):
     F = np.concatenate([inverted_gradients(dim), [np.diag([1.0, 1.0, 0.0][3 - dim :])]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -150,6 +151,7 @@ class Simulation:
         self.solver = solver or scene.solver
         self.stepper = self.solver.stepper(self.model)
         interval = 1.0 / scene.fps
+        self._warned: set[str] = set()  # bodies whose inverted cells have been told of
         self.steps_per_frame = max(1, math.ceil(interval / self._wanted_dt(interval) - 1e-9))
         self.dt = interval / self.steps_per_frame
         if scene.frames > 0:
@@ -241,6 +243,7 @@ class Simulation:
                 f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). A smaller dt, or a material that "
                 "bears inversion (StableNeoHookean), may help"
             )
+        self._warn_of_inverted_cells(jacobian)
         return Frame(
             index=index,
             time=state.time,
@@ -251,6 +254,21 @@ class Simulation:
             energies=model.energies(state),
             penetration=0.0 if model.contact is None else model.contact.depth(displacement),
         )
+
+    def _warn_of_inverted_cells(self, jacobian: np.ndarray) -> None:
+        """Warns, once for each body: the energies of most materials have other minima than the rest shape there."""
+        for body, (_, cells) in zip(self.scene.bodies, body_slices(self.model), strict=True):
+            inverted = np.flatnonzero(jacobian[cells] <= 0.0)
+            if len(inverted) and body.name not in self._warned and not body.material.constitutive.convex:
+                self._warned.add(body.name)
+                kind = type(body.material).__name__
+                warnings.warn(
+                    f"t = {self.state.time:.6g} s: {len(inverted)} of {body.mesh.cell_count} cells of body "
+                    f"'{body.name}' are inverted (the first is cell {inverted[0]}, J = "
+                    f"{jacobian[cells][inverted[0]]:.4g}): "
+                    + ("it may fold" if body.material.resists_mirroring else f"{kind} does not turn them back"),
+                    stacklevel=2,
+                )
 
 
 def body_slices(model: Model) -> list[tuple[slice, slice]]:

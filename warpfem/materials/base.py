@@ -47,6 +47,8 @@ class Material(ABC):
     """Base of all materials: the functions and the parameters of a hyperelastic solid."""
 
     name: ClassVar[str]
+    resists_mirroring: ClassVar[bool] = True
+    """Whether a mirrored cell has more energy than one at rest."""
 
     @property
     @abstractmethod
