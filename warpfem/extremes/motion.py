@@ -1,0 +1,97 @@
+"""Small scenes in motion: what the cases that step through time share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from warpfem.dtypes import FloatName
+from warpfem.errors import WarpfemError
+from warpfem.extremes.table import Trial
+from warpfem.materials import MATERIALS, HookeanMaterial, LinearElasticity, StableNeoHookean
+from warpfem.mesh import Mesh
+from warpfem.scene import Body, Scene
+from warpfem.simulation import Simulation
+from warpfem.solvers import BackwardEuler, Solver, SymplecticEuler, VelocityVerlet
+
+Material: TypeAlias = type[HookeanMaterial]
+
+EXPLICIT = (SymplecticEuler(), VelocityVerlet())
+IMPLICIT = (BackwardEuler(), BackwardEuler.linearised())
+NEWTON, LINEARISED = IMPLICIT
+VERLET = EXPLICIT[1]
+
+EPSILON = {name: float(np.finfo(name).eps) for name in ("float32", "float64")}
+"""Distance from 1 to the next larger number."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A material, a dimension and a precision."""
+
+    material: Material
+    dim: int
+    dtype: FloatName
+
+    def __str__(self) -> str:
+        return f"{self.material.__name__}, {self.dim}D, {self.dtype}"
+
+    @property
+    def epsilon(self) -> float:
+        """Distance from 1 to the next larger number."""
+        return EPSILON[self.dtype]
+
+    def vector(self, *components: float) -> tuple[float, ...]:
+        """The first ``dim`` components, filled up with zeros."""
+        return (*components, 0.0, 0.0, 0.0)[: self.dim]
+
+    def brick(self, size: Sequence[float], cells: Sequence[int], origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Mesh:
+        """A rectangle or a box, of the first ``dim`` entries of each."""
+        builder = Mesh.rectangle if self.dim == 2 else Mesh.box
+        return builder(size[: self.dim], cells[: self.dim], origin[: self.dim])
+
+    def simulation(
+        self, bodies: list[Body], solver: Solver, dt: float, frames: int, steps_per_frame: int = 1, **scene: Any
+    ) -> Simulation:
+        """A simulation on the CPU with steps of ``dt`` [s], as many to a frame as given."""
+        fps = 1.0 / (steps_per_frame * dt)
+        return Simulation(Scene(bodies, solver, dt=dt, fps=fps, frames=frames, **scene), device="cpu", dtype=self.dtype)
+
+
+def settings(quick: bool, without: Sequence[Material] = ()) -> Iterator[Setting]:
+    """The settings of a case: two when quick, else all materials, dimensions and precisions."""
+    if quick:
+        frugal = (Setting(StableNeoHookean, 3, "float32"), Setting(LinearElasticity, 2, "float64"))
+        yield from (setting for setting in frugal if setting.material not in without)
+        return
+    materials = [material for material in MATERIALS.values() if material not in without]
+    for material, dim, dtype in product(materials, (2, 3), EPSILON):
+        yield Setting(material, dim, dtype)  # type: ignore[arg-type]
+
+
+def solver_name(solver: Solver) -> str:
+    """What a solver is called in the table."""
+    return "linearised backward Euler" if solver == LINEARISED else type(solver).__name__
+
+
+def attempt(setting: str, action: Callable[[], Trial], *, may_refuse: bool = False) -> Trial:
+    """The trial that ``action`` makes; if warpfem refuses instead, that is what the trial says."""
+    try:
+        return action()
+    except WarpfemError as error:
+        return Trial(setting, "refused" if may_refuse else "FAIL", "", str(error))
+
+
+def momentum(mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Linear momentum [kg m/s]."""
+    return mass @ velocity
+
+
+def angular_momentum(mass: np.ndarray, points: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Angular momentum about the centre of mass [kg m^2/s], (1,) in the plane, (3,) in space."""
+    centre, drift = mass @ points / mass.sum(), mass @ velocity / mass.sum()
+    return np.atleast_1d(mass @ np.cross(points - centre, velocity - drift))
