@@ -26,7 +26,6 @@ from warpfem.extremes.motion import (
 from warpfem.extremes.table import Trial, at_most, case
 from warpfem.materials import LinearElasticity
 from warpfem.model import Energies, Model
-from warpfem.moduli import ElasticModuli, elastic_moduli
 from warpfem.scene import Body, Scene
 from warpfem.simulation import Frame, Simulation
 from warpfem.solvers import Solver
@@ -38,16 +37,17 @@ from warpfem.solvers import Solver
     12,
     "mass contrast 1e6 in one body",
     "Hanging from its light half, or from its heavy half: each half is stretched by the weight below it over E A "
-    "(nu = 0, strain 1e-4), to 1e-3, after implicit steps of 1 s. Let go from a stretch of 1 % in free flight with "
-    "explicit steps: energy within 5 % of the start, linear momentum below sqrt(steps) roundings of the sum of m |v|.",
+    "(nu = 0, strain 1e-4), to 1e-3 of the greater stretch, after implicit steps of 1 s. Let go from a stretch of 1"
+    " % in free flight with explicit steps at half their limit: energy within 10 % of the start, its means over the"
+    " first and the last fifth within 2 %, linear momentum below sqrt(steps) roundings of the sum of m |v|.",
 )
 def mass_contrast(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
         for heavy, solver in product(("bottom", "top"), IMPLICIT):
             label = f"{setting}, {solver_name(solver)}, {heavy} half heavy"
-            yield attempt(label, lambda s=setting, h=heavy, v=solver, t=label: _hanging(t, s, h, v))
-        for solver in EXPLICIT[1:] if quick else EXPLICIT:
-            yield from _contrast_in_flight(f"{setting}, {solver_name(solver)}", setting, solver)
+            yield attempt(_hanging, label, setting, heavy, solver)
+        for explicit in EXPLICIT[1:] if quick else EXPLICIT:
+            yield from _contrast_in_flight(f"{setting}, {solver_name(explicit)}", setting, explicit)
 
 
 def _column(setting: Setting, heavy: str, E: float, **body) -> Body:
@@ -65,14 +65,14 @@ def _hanging(label: str, setting: Setting, heavy: str, solver: Solver) -> Trial:
     for _ in simulation.frames():
         pass
     strain = simulation.model.stresses(simulation.state).deformation_gradient[:, 1, 1] - 1.0
-    volume = column.mesh.cell_volumes
-    upper = (column.density == 1e6) == (heavy == "top")
+    volume, density = column.mesh.cell_volumes, np.asarray(column.density)
+    upper = (density == 1e6) == (heavy == "top")
     halves = {"upper": upper, "lower": ~upper}
-    weight = {name: g * column.density[half] @ volume[half] for name, half in halves.items()}
+    weight = {name: g * density[half] @ volume[half] for name, half in halves.items()}
     force = {"upper": weight["lower"] + 0.5 * weight["upper"], "lower": 0.5 * weight["lower"]}  # the area is 1
-    worst = max(
-        abs(strain[half] @ volume[half] / volume[half].sum() / (force[name] / E) - 1.0) for name, half in halves.items()
-    )
+    expected = {name: force[name] / E for name in halves}
+    errors = [abs(strain[half] @ volume[half] / volume[half].sum() - expected[name]) for name, half in halves.items()]
+    worst = max(errors) / max(expected.values())
     return at_most(label, worst, 1e-3)
 
 
@@ -84,7 +84,7 @@ def _contrast_in_flight(label: str, setting: Setting, solver: Solver) -> Iterato
     frames, steps = 20, 50
     dt = 0.5 * _stable_dt(setting, column, solver)
     simulation = setting.simulation([column], solver, dt, frames, steps)
-    yield from _flight(label, simulation, frames * steps, energy_limit=0.05)
+    yield from _flight(label, simulation, frames * steps, energy_limit=0.1)
 
 
 def _stable_dt(setting: Setting, body: Body, solver: Solver) -> float:
@@ -114,8 +114,12 @@ def _flight(
     except WarpfemError as error:
         yield Trial(label, "FAIL", "", str(error))
         return
-    drift = float(np.abs(np.array(energy) / energy[0] - 1.0).max())
-    yield at_most(f"{label}: energy", drift, energy_limit)
+    total = np.array(energy) / energy[0]
+    fifth = len(total) // 5
+    yield at_most(f"{label}: energy", float(np.abs(total - 1.0).max()), energy_limit)
+    yield at_most(
+        f"{label}: drift of energy", float(abs(total[-fifth:].mean() - total[:fifth].mean())), 0.2 * energy_limit
+    )
     allowed = steps**0.5 * epsilon
     change = float(np.linalg.norm(np.array(linear) - linear[0], axis=1).max())
     yield at_most(f"{label}: linear momentum", change / size, allowed)
@@ -130,9 +134,10 @@ def _flight(
 @case(
     13,
     "dt from 1e-6 to 10 s at E from 1e3 to 1e11",
-    "30 steps. Unloaded from a stretch of 10 % with noise of 1 % and no momentum, backward Euler: the total energy in "
-    "the second half of the run is at no time above that halfway, and at the end below that of the start, to 1e-4 of "
-    "the start. Pinned, under gravity, from rest, backward Euler: the total energy, which is 0 at the start, is never "
+    "30 steps. Unloaded from a stretch of 10 % with noise of 1 % and no momentum, backward Euler: the total energy "
+    "in the second half of the run is at no time above that halfway, and at the end below that of the start, to "
+    "1e-4 of the start. In free fall from a place 0.1 m from that at rest, implicit steps: the speed is g t to "
+    "1e-3. Pinned, under gravity, from rest, backward Euler: the total energy, which is 0 at the start, is never "
     "above 1e-3 of its largest part. Linearised backward Euler, unloaded: never above 10 times the start. Explicit "
     "steps, unloaded: below the limit within 35 % of the start, above it refused.",
 )
@@ -144,10 +149,29 @@ def time_steps(quick: bool) -> Iterator[Trial]:
             ("unloaded, linearised backward Euler", LINEARISED, _growth, 10.0),
         ):
             yield _over_time_steps(f"{setting}, {name}", setting, quick, solver, measure, limit)
+        for implicit in IMPLICIT:
+            for dt in _time_steps(quick):
+                label = f"{setting}, free fall, {solver_name(implicit)}, dt = {dt:g} s"
+                yield attempt(_fall, label, setting, implicit, dt)
         for explicit in EXPLICIT:
             yield _over_time_steps(
                 f"{setting}, unloaded, {solver_name(explicit)}", setting, quick, explicit, _swing, 0.35
             )
+
+
+def _time_steps(quick: bool) -> tuple[float, ...]:
+    return (1e-6, 1e-4, 10.0) if quick else (1e-6, 1e-4, 1e-2, 1.0, 10.0)
+
+
+def _fall(label: str, setting: Setting, solver: Solver, dt: float) -> Trial:
+    mesh = setting.brick((1.0, 1.0, 1.0), (2, 2, 2))
+    body = Body("block", mesh, setting.material(E=1e5, nu=0.3), displacement=(0.1,) * setting.dim)
+    simulation = setting.simulation([body], solver, dt, 30, gravity=setting.vector(0.0, -9.81))
+    for frame in simulation.frames():
+        last = frame
+    mass = simulation.model.lumped_mass
+    speed = -momentum(mass, last.velocity)[1] / mass.sum()
+    return at_most(label, abs(speed / (9.81 * last.time) - 1.0), 1e-3)
 
 
 def _over_time_steps(
@@ -155,8 +179,7 @@ def _over_time_steps(
 ) -> Trial:
     """The worst figure over the time steps and stiffnesses, or what stopped some of them."""
     worst, where, stopped = -np.inf, "", []
-    times = (1e-6, 1e-2, 10.0) if quick else (1e-6, 1e-4, 1e-2, 1.0, 10.0)
-    for E, dt in product((1e3, 1e11) if quick else (1e3, 1e5, 1e7, 1e9, 1e11), times):
+    for E, dt in product((1e3, 1e11) if quick else (1e3, 1e5, 1e7, 1e9, 1e11), _time_steps(quick)):
         at = f"E = {E:g} Pa, dt = {dt:g} s"
         try:
             figure = measure(_energies(setting, solver, E, dt, loaded=measure is _gain))
@@ -216,19 +239,17 @@ def _swing(energies: list[Energies]) -> float:
 @case(
     14,
     "explicit steps at 0.99, 1.01, 2 and 100 times their limit",
-    "0.99 times the least limit of the motion: 2000 steps (quick: 300) stay bounded, from noise of 1e-6 of the size, "
-    "where all modes move, below 51 times the energy of the start (1 / (1 - 0.99^2), what the scheme itself allows), "
-    "and from a stretch of 20 %, within 50 % of it. Above the limit of the start: refused by a TimeStepError that "
-    "says the limit to 1 %.",
+    "0.99 times the least limit of the motion: 2000 steps (quick: 300) stay bounded, from noise of 1e-6 of the "
+    "size, where all modes move, below the multiple of the energy of the start that the scheme has in its fastest "
+    "mode, 199 for symplectic Euler, (1 + 0.99) / (1 - 0.99), 51 for Verlet, 1 / (1 - 0.99^2), and from a stretch "
+    "of 20 % below 2. Above the limit of the start: refused by a TimeStepError that says the limit to 1e-3.",
 )
 def explicit_limit(quick: bool) -> Iterator[Trial]:
     for setting, solver in product(settings(quick), EXPLICIT):
         label = f"{setting}, {solver_name(solver)}"
-        for name, limit in (("noise", 50.0), ("stretch", 0.5)):
+        for name, limit in (("noise", 51.0 if solver is VERLET else 199.0), ("stretch", 2.0)):
             where = f"{label}, 0.99, from a {name}"
-            yield attempt(
-                where, lambda a=where, s=setting, v=solver, n=name, m=limit: _below_limit(a, s, v, n, m, quick)
-            )
+            yield attempt(_below_limit, where, setting, solver, name, limit, quick)
         for factor in (1.01, 2.0, 100.0):
             yield _above_limit(f"{label}, {factor:g}", setting, solver, factor)
 
@@ -254,7 +275,7 @@ def _below_limit(label: str, setting: Setting, solver: Solver, start: str, limit
         dt = min(dt, survey.stepper.stable_dt(survey.state) or dt)
     simulation = setting.simulation([body], solver, 0.99 * dt, steps // of_a_frame, of_a_frame)
     energies = [frame.energies for frame in simulation.frames()]
-    return at_most(label, _swing(energies), limit)
+    return at_most(label, _growth(energies), limit)
 
 
 def _above_limit(label: str, setting: Setting, solver: Solver, factor: float) -> Trial:
@@ -265,7 +286,7 @@ def _above_limit(label: str, setting: Setting, solver: Solver, factor: float) ->
             pass
     except TimeStepError as error:
         numbers = [float(number) for number in re.findall(r"\d[\d.]*(?:e[-+]?\d+)?", str(error))]
-        said = any(abs(number / limit - 1.0) <= 0.01 for number in numbers) or factor == 1.01 and len(numbers) > 1
+        said = any(abs(number / limit - 1.0) <= 1e-3 for number in numbers)
         return Trial(label, "refused" if said else "FAIL", "" if said else "the limit is not said", str(error))
     except WarpfemError as error:
         return Trial(label, "FAIL", "not a TimeStepError", str(error))
@@ -278,9 +299,10 @@ def _above_limit(label: str, setting: Setting, solver: Solver, factor: float) ->
 @case(
     16,
     "1e5 Verlet steps in free flight",
-    "A spinning, vibrating block (quick: 2000 steps): at all frames the energy within 1 % of the start; the linear "
-    "momentum within sqrt(steps) roundings of the sum of m |v|; the angular momentum within ten times as many of the "
-    "sum of m |x| |v| (not for linear elasticity, whose rotated bodies grow).",
+    "A spinning, vibrating block, dt half the limit (quick: 2000 steps): at all frames the energy within 5 % of the"
+    " start, its means over the first and the last fifth within 1 %; the linear momentum within sqrt(steps) "
+    "roundings of the sum of m |v|; the angular momentum within ten times as many of the sum of m |x| |v| (not for "
+    "linear elasticity, whose rotated bodies grow).",
 )
 def long_flight(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
@@ -300,7 +322,7 @@ def long_flight(quick: bool) -> Iterator[Trial]:
         dt = 0.5 * _stable_dt(setting, body, VERLET)
         simulation = setting.simulation([body], VERLET, dt, frames, steps)
         rotates = setting.material is not LinearElasticity
-        yield from _flight(str(setting), simulation, frames * steps, 0.01, spins=rotates)
+        yield from _flight(str(setting), simulation, frames * steps, 0.05, spins=rotates)
 
 
 def _whirl(x: np.ndarray, rate: float) -> np.ndarray:
@@ -316,12 +338,12 @@ def _whirl(x: np.ndarray, rate: float) -> np.ndarray:
 @case(
     17,
     "spin at 100 turns a second",
-    "A slender bar of half length L = 0.5 m, nu = 0, E = 1e10 Pa, started in the stretch of the spin. Verlet: after 5 "
-    "turns (quick: 1/4) the angle to 1e-3 of it, the stretch rho (w L)^2 / (3 E) to 5 %, the energy to 1 %. Backward "
-    "Euler, 1000, 100, 4 and 0.25 steps a turn: the angle that its rule gives a rigid body, tan a' = sin a / "
-    "(2 - cos a) step by step, to 1e-2 rad, and no gain of energy. A soft bar, E = 1e6 Pa, with Verlet, dt = 'auto': "
-    "energy to 5 %, angular momentum to 1e-4, or a refused time step. Not for linear elasticity, whose rotated bodies "
-    "grow.",
+    "A slender bar of half length L = 0.5 m, nu = 0, E = 1e10 Pa, started in the stretch of the spin. Verlet: after"
+    " 5 turns (quick: 1/4) the angle to 1e-3 of it, the stretch rho (w L)^2 / (3 E) to 5 %, the energy to 1 %. "
+    "Backward Euler, 1000, 100, 4 and 0.25 steps a turn: the angle that its rule gives a rigid body, tan a' = sin a"
+    " / (2 - cos a) step by step, to 1 % (the bar is not quite rigid), and no gain of energy. A soft bar, E = 1e6 "
+    "Pa, with Verlet, dt = 'auto': energy to 5 %, angular momentum to 1e-4, or a refused time step. Not for linear "
+    "elasticity, whose rotated bodies grow.",
 )
 def spin(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick, without=[LinearElasticity]):
@@ -398,7 +420,7 @@ def _implicit_spin(label: str, setting: Setting, steps_a_turn: float) -> Iterato
         turn = np.arctan2(np.sin(turn), 2.0 - np.cos(turn))
     ends = np.array([_ends(bar.mesh.points, frame) for frame in run])
     angle = np.unwrap(np.arctan2(ends[:, 1], ends[:, 0]))
-    yield at_most(f"{label}: angle", float(abs(angle[-1] - angle[0] - expected)), 1e-2, " rad")
+    yield at_most(f"{label}: angle", float(abs((angle[-1] - angle[0]) / expected - 1.0)), 1e-2)
     total = np.array([frame.energies.total for frame in run])
     yield at_most(f"{label}: gain of energy", float(total.max() / total[0] - 1.0), 1e-4)
 
@@ -426,15 +448,15 @@ def _soft_spin(label: str, setting: Setting, turns: float) -> Iterator[Trial]:
 @case(
     18,
     "a fixed body pulled by 1000 times its stiffness E A",
-    "A bar on rollers under a dead traction of 1000 E, nu = 0.3. Implicit steps of 100 s: within 20 steps the stretch "
-    "of the material's law under uniaxial stress to 1e-3, or refused. Verlet, dt = 'auto': energy and work of the "
-    "load sum up to 0 within 2 % of the work, or a refused time step.",
+    "A bar on rollers under a dead traction of 1000 E, nu = 0.3. Implicit steps of 100 s: within 20 steps the "
+    "stretch of the material's law under uniaxial stress to 1e-3, or refused. Verlet, dt = 'auto': energy and work "
+    "of the load sum up to 0 within 2 % of the work, or a refused time step.",
 )
 def great_force(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
         for solver in IMPLICIT:
             label = f"{setting}, {solver_name(solver)}"
-            yield attempt(label, lambda s=setting, v=solver, t=label: _pulled(t, s, v), may_refuse=True)
+            yield attempt(_pulled, label, setting, solver, may_refuse=True)
         yield _pulled_explicitly(f"{setting}, VelocityVerlet", setting)
 
 
@@ -452,7 +474,7 @@ def _pulled(label: str, setting: Setting, solver: Solver) -> Trial:
     for frame in simulation.frames():
         last = frame
     stretch = 1.0 + last.displacement[bar.mesh.select_points("right"), 0].mean() / 2.0
-    expected = uniaxial_stretch(setting, elastic_moduli(E=1e5, nu=0.3), 1e8)
+    expected = uniaxial_stretch(setting, 1e5, 0.3, 1e8)
     return at_most(f"{label}, to a stretch of {expected:.4g}", float(abs(stretch / expected - 1.0)), 1e-3)
 
 
@@ -498,8 +520,9 @@ PRINCIPAL_STRESS = {
 """The principal first Piola-Kirchhoff stresses of each material [Pa] from the principal stretches."""
 
 
-def uniaxial_stretch(setting: Setting, moduli: ElasticModuli, stress: float) -> float:
+def uniaxial_stretch(setting: Setting, E: float, nu: float, stress: float) -> float:
     """The stretch under a nominal stress [Pa] along x with free sides (2D: plane strain), by bisection."""
+    mu, lam = E / (2.0 * (1.0 + nu)), E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
     law = PRINCIPAL_STRESS[setting.material.name]
     least = -1e4 if setting.material is LinearElasticity else 1e-12
 
@@ -508,10 +531,10 @@ def uniaxial_stretch(setting: Setting, moduli: ElasticModuli, stress: float) -> 
 
     def contracted(along: float) -> np.ndarray:
         """The stretches with no stress across: St. Venant-Kirchhoff collapses where there are none."""
-        across = _root(lambda s: law(stretches(along, s), moduli.mu, moduli.lam)[1], least, 1.0)
+        across = _root(lambda s: law(stretches(along, s), mu, lam)[1], least, 1.0)
         return stretches(along, across)
 
-    return _root(lambda s: law(contracted(s), moduli.mu, moduli.lam)[0] - stress, 1.0, 1e5)
+    return _root(lambda s: law(contracted(s), mu, lam)[0] - stress, 1.0, 1e5)
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
@@ -531,36 +554,33 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
 @case(
     19,
     "impact at 100 m/s on a plane and on a sphere",
-    "A cube of 0.4 m, E = 1e6 (three times slower waves than the impact) and 1e9 Pa, flies at a plane and at the middle "
-    "of a sphere of radius 1 m, and the run lasts ten times the flight through its own length. No boundary point ever "
-    "passes the sphere's centre or is more than the body's size inside an obstacle; at the end none is more than a "
-    "tenth of the size inside; the kinetic, elastic and contact energy is never more than 1.05 times that of the "
-    "start. Or refused.",
+    "A cube of 0.4 m, E = 1e5 (waves ten times slower than the impact) to 1e9 Pa, flies at a plane and at the "
+    "middle of a sphere of radius 1 m, and the run lasts five times the flight through its own length. No boundary "
+    "point ever passes the sphere's centre or is more than the body's size inside an obstacle; at the end none is "
+    "more than a tenth of the size inside; the kinetic, elastic and contact energy is never more than 1.05 times "
+    "that of the start. Or refused.",
 )
 def impact(quick: bool) -> Iterator[Trial]:
-    solvers: list[tuple[Solver, float | None]] = [(NEWTON, 1e-4), (NEWTON, 1.0 / 120.0), (VERLET, None)]
+    solvers: list[tuple[Solver, float | None]] = [(NEWTON, 2e-4), (NEWTON, 1.0 / 24.0), (VERLET, None)]
     if not quick:
-        solvers += [(NEWTON, 1.0 / 24.0), (LINEARISED, 1e-4), (LINEARISED, 1.0 / 120.0), (EXPLICIT[0], None)]
-    for setting, (solver, dt), E in product(settings(quick), solvers, (1e6, 1e9)):
+        solvers += [(NEWTON, 1.0 / 120.0), (LINEARISED, 2e-4), (LINEARISED, 1.0 / 120.0), (EXPLICIT[0], None)]
+    stiffnesses = (1e5, 1e9) if quick else (1e5, 1e7, 1e9)
+    for setting, (solver, dt), E in product(settings(quick), solvers, stiffnesses):
         for obstacle in (
             Plane(setting.vector(), setting.vector(0.0, 1.0)),
             Sphere(setting.vector(0.0, -1.0), 1.0),
         ):
             step = "dt = 'auto'" if dt is None else f"dt = {dt:.3g} s"
             label = f"{setting}, {solver_name(solver)}, {step}, E = {E:g} Pa, {type(obstacle).__name__}"
-            yield attempt(
-                label,
-                lambda a=label, s=setting, v=solver, d=dt, e=E, o=obstacle: _thrown(a, s, v, d, e, o),
-                may_refuse=True,
-            )
+            yield attempt(_thrown, label, setting, solver, dt, E, obstacle, may_refuse=True)
 
 
 def _thrown(label: str, setting: Setting, solver: Solver, dt: float | None, E: float, obstacle: Obstacle) -> Trial:
     size, speed = 0.4, 100.0
     mesh = setting.brick((size,) * 3, (3, 3, 3), (-0.5 * size, 0.1, -0.5 * size))
     body = Body("cube", mesh, setting.material(E=E, nu=0.3), velocity=setting.vector(0.0, -speed))
-    duration = 10.0 * size / speed
-    frames = 40 if dt is None else max(4, round(duration / dt))
+    duration = 5.0 * size / speed
+    frames = 20 if dt is None else max(4, round(duration / dt))
     fps = frames / duration if dt is None else 1.0 / dt
     scene = Scene([body], solver, dt=dt or "auto", fps=fps, frames=frames, obstacles=[obstacle])
     simulation = Simulation(scene, device="cpu", dtype=setting.dtype)

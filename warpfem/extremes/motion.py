@@ -78,10 +78,10 @@ def solver_name(solver: Solver) -> str:
     return "linearised backward Euler" if solver == LINEARISED else type(solver).__name__
 
 
-def attempt(setting: str, action: Callable[[], Trial], *, may_refuse: bool = False) -> Trial:
-    """The trial that ``action`` makes; if warpfem refuses instead, that is what the trial says."""
+def attempt(trial: Callable[..., Trial], setting: str, *arguments: Any, may_refuse: bool = False) -> Trial:
+    """``trial(setting, *arguments)``; if warpfem refuses instead, that is what the trial says."""
     try:
-        return action()
+        return trial(setting, *arguments)
     except WarpfemError as error:
         return Trial(setting, "refused" if may_refuse else "FAIL", "", str(error))
 
