@@ -25,8 +25,7 @@ IMPLICIT = (BackwardEuler(), BackwardEuler.linearised())
 NEWTON, LINEARISED = IMPLICIT
 VERLET = EXPLICIT[1]
 
-EPSILON = {name: float(np.finfo(name).eps) for name in ("float32", "float64")}
-"""Distance from 1 to the next larger number."""
+DTYPES: tuple[FloatName, ...] = ("float32", "float64")
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,6 @@ class Setting:
 
     def __str__(self) -> str:
         return f"{self.material.__name__}, {self.dim}D, {self.dtype}"
-
-    @property
-    def epsilon(self) -> float:
-        """Distance from 1 to the next larger number."""
-        return EPSILON[self.dtype]
 
     def vector(self, *components: float) -> tuple[float, ...]:
         """The first ``dim`` components, filled up with zeros."""
@@ -69,8 +63,8 @@ def settings(quick: bool, without: Sequence[Material] = ()) -> Iterator[Setting]
         yield from (setting for setting in frugal if setting.material not in without)
         return
     materials = [material for material in MATERIALS.values() if material not in without]
-    for material, dim, dtype in product(materials, (2, 3), EPSILON):
-        yield Setting(material, dim, dtype)  # type: ignore[arg-type]
+    for material, dim, dtype in product(materials, (2, 3), DTYPES):
+        yield Setting(material, dim, dtype)
 
 
 def solver_name(solver: Solver) -> str:
