@@ -14,6 +14,7 @@ from warpfem.errors import WarpfemError
 from warpfem.extremes.table import Trial
 from warpfem.materials import MATERIALS, HookeanMaterial, LinearElasticity, StableNeoHookean
 from warpfem.mesh import Mesh
+from warpfem.model import Model
 from warpfem.scene import Body, Scene
 from warpfem.simulation import Simulation
 from warpfem.solvers import BackwardEuler, Solver, SymplecticEuler, VelocityVerlet
@@ -78,6 +79,25 @@ def attempt(trial: Callable[..., Trial], setting: str, *arguments: Any, may_refu
         return trial(setting, *arguments)
     except WarpfemError as error:
         return Trial(setting, "refused" if may_refuse else "FAIL", "", str(error))
+
+
+def stable_dt(setting: Setting, body: Body, solver: Solver) -> float:
+    """The stability limit of explicit steps for a body that nothing acts on, as it starts [s]."""
+    model = Model(Scene([body], solver), device="cpu", dtype=setting.dtype)
+    limit = solver.stepper(model).stable_dt(model.state())
+    assert limit is not None
+    return limit
+
+
+def natural_growth(solver: Solver, fraction: float) -> float:
+    """How often an explicit scheme can have its energy of the start at ``fraction`` of its limit, without growth.
+
+    It conserves another energy. In a mode of angular frequency w, with c = w dt / 2, that is (v^2 + (1 - c^2) w^2 u^2)
+    / 2 for Verlet and (v^2 + w^2 u^2 - 2 c w u v) / 2 for symplectic Euler; the fastest mode has c = ``fraction``.
+    """
+    if solver == VERLET:
+        return 1.0 / (1.0 - fraction**2)
+    return (1.0 + fraction) / (1.0 - fraction)
 
 
 def momentum(mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
