@@ -38,10 +38,10 @@ from warpfem.solvers import Solver
 @case(
     12,
     "mass contrast 1e6 in one body",
-    "Hanging from its light half, or from its heavy half: each half is stretched by the weight below it over E A "
-    "(nu = 0, strain 1e-4), to 1e-3 of the greater stretch, after implicit steps of 1 s. Let go from a stretch of 1"
-    " % in free flight with explicit steps at half their limit: energy within 10 % of the start, its means over the"
-    " first and the last fifth within 2 %, linear momentum below sqrt(steps) roundings of the sum of m |v|.",
+    "Hanging from its light half, or from its heavy half: each half is stretched by the weight below it over E A (nu "
+    "= 0, strain 1e-4), to 1e-3 of the greater stretch, after implicit steps of 1 s. Let go from a stretch of 1 % in "
+    "free flight with explicit steps at half their limit: energy within 10 % of the start, its means over the first "
+    "and the last fifth within 2 %, linear momentum below sqrt(steps) roundings of the sum of m |v|.",
 )
 def mass_contrast(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
@@ -128,12 +128,12 @@ def _flight(
 @case(
     13,
     "dt from 1e-6 to 10 s at E from 1e3 to 1e11",
-    "30 steps. Unloaded from a stretch of 10 % with noise of 1 % and no momentum, backward Euler: the total energy "
-    "in the second half of the run is at no time above that halfway, and at the end below that of the start, to "
-    "1e-4 of the start. In free fall from a place 0.1 m from that at rest, implicit steps: the speed is g t to "
-    "1e-3. Pinned, under gravity, from rest, backward Euler: the total energy, which is 0 at the start, is never "
-    "above 1e-3 of its largest part. Linearised backward Euler, unloaded: never above 10 times the start. Explicit "
-    "steps, unloaded: below the limit within 35 % of the start, above it refused.",
+    "30 steps. Unloaded from a stretch of 10 % with noise of 1 % and no momentum, backward Euler: the total energy in "
+    "the second half of the run is at no time above that halfway, and at the end below that of the start, to 1e-4 of "
+    "the start. In free fall from a place 0.1 m from that at rest, implicit steps: the speed is g t to 1e-3. Pinned, "
+    "under gravity, from rest, backward Euler: the total energy, which is 0 at the start, is never above 1e-3 of its "
+    "largest part. Linearised backward Euler, unloaded: never above 10 times the start. Explicit steps, unloaded: "
+    "below the limit within 35 % of the start, above it refused.",
 )
 def time_steps(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
@@ -233,10 +233,10 @@ def _swing(energies: list[Energies]) -> float:
 @case(
     14,
     "explicit steps at 0.99, 1.01, 2 and 100 times their limit",
-    "0.99 times the least limit of the motion: 2000 steps (quick: 300) stay bounded, from noise of 1e-6 of the "
-    "size, where all modes move, below the multiple of the energy of the start that the scheme has in its fastest "
-    "mode, 199 for symplectic Euler, (1 + 0.99) / (1 - 0.99), 50 for Verlet, 1 / (1 - 0.99^2), and from a stretch "
-    "of 20 % below 2. Above the limit of the start: refused by a TimeStepError that says the limit to 1e-3.",
+    "0.99 times the least limit of the motion: 2000 steps (quick: 300) stay bounded, from noise of 1e-6 of the size, "
+    "where all modes move, below the multiple of the energy of the start that the scheme has in its fastest mode, 199 "
+    "for symplectic Euler, (1 + 0.99) / (1 - 0.99), 50 for Verlet, 1 / (1 - 0.99^2), and from a stretch of 20 % below "
+    "2. Above the limit of the start: refused by a TimeStepError that says the limit to 1e-3.",
 )
 def explicit_limit(quick: bool) -> Iterator[Trial]:
     for setting, solver in product(settings(quick), EXPLICIT):
@@ -293,10 +293,10 @@ def _above_limit(label: str, setting: Setting, solver: Solver, factor: float) ->
 @case(
     16,
     "1e5 Verlet steps in free flight",
-    "A spinning, vibrating block, dt half the limit (quick: 2000 steps): at all frames the energy within 5 % of the"
-    " start, its means over the first and the last fifth within 1 %; the linear momentum within sqrt(steps) "
-    "roundings of the sum of m |v|; the angular momentum within ten times as many of the sum of m |x| |v| (not for "
-    "linear elasticity, whose rotated bodies grow).",
+    "A spinning, vibrating block, dt half the limit (quick: 2000 steps): at all frames the energy within 5 % of the "
+    "start, its means over the first and the last fifth within 1 %; the linear momentum within sqrt(steps) roundings "
+    "of the sum of m |v|; the angular momentum within ten times as many of the sum of m |x| |v| (not for linear "
+    "elasticity, whose rotated bodies grow).",
 )
 def long_flight(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
@@ -332,12 +332,12 @@ def _whirl(x: np.ndarray, rate: float) -> np.ndarray:
 @case(
     17,
     "spin at 100 turns a second",
-    "A slender bar of half length L = 0.5 m, nu = 0, E = 1e10 Pa, started in the stretch of the spin. Verlet: after"
-    " 5 turns (quick: 1/4) the angle to 1e-3 of it, the stretch rho (w L)^2 / (3 E) to 5 %, the energy to 1 %. "
-    "Backward Euler, 1000, 100, 4 and 0.25 steps a turn: the angle that its rule gives a rigid body, tan a' = sin a"
-    " / (2 - cos a) step by step, to 1 % (the bar is not quite rigid), and no gain of energy. A soft bar, E = 1e6 "
-    "Pa, with Verlet, dt = 'auto': energy to 5 %, angular momentum to 1e-4, or a refused time step. Not for linear "
-    "elasticity, whose rotated bodies grow.",
+    "A slender bar of half length L = 0.5 m, nu = 0, E = 1e10 Pa, started in the stretch of the spin. Verlet: after 5 "
+    "turns (quick: 1/4) the angle to 1e-3 of it, the stretch rho (w L)^2 / (3 E) to 5 %, the energy to 1 %. Backward "
+    "Euler, 1000, 100, 4 and 0.25 steps a turn: the angle that its rule gives a rigid body, tan a' = sin a / (2 - cos "
+    "a) step by step, to 1 % (the bar is not quite rigid), and no gain of energy. A soft bar, E = 1e6 Pa, with "
+    "Verlet, dt = 'auto': energy to 5 %, angular momentum to 1e-4, or a refused time step. Not for linear elasticity, "
+    "whose rotated bodies grow.",
 )
 def spin(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick, without=[LinearElasticity]):
@@ -442,9 +442,9 @@ def _soft_spin(label: str, setting: Setting, turns: float) -> Iterator[Trial]:
 @case(
     18,
     "a fixed body pulled by 1000 times its stiffness E A",
-    "A bar on rollers under a dead traction of 1000 E, nu = 0.3. Implicit steps of 100 s: within 20 steps the "
-    "stretch of the material's law under uniaxial stress to 1e-3, or refused. Verlet, dt = 'auto': energy and work "
-    "of the load sum up to 0 within 2 % of the work, or a refused time step.",
+    "A bar on rollers under a dead traction of 1000 E, nu = 0.3. Implicit steps of 100 s: within 20 steps the stretch "
+    "of the material's law under uniaxial stress to 1e-3, or refused. Verlet, dt = 'auto': energy and work of the "
+    "load sum up to 0 within 2 % of the work, or a refused time step.",
 )
 def great_force(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
@@ -548,11 +548,11 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
 @case(
     19,
     "impact at 100 m/s on a plane and on a sphere",
-    "A cube of 0.4 m, E = 1e5 (waves ten times slower than the impact) to 1e9 Pa, flies at a plane and at the "
-    "middle of a sphere of radius 1 m, and the run lasts five times the flight through its own length. No boundary "
-    "point ever passes the sphere's centre or is more than the body's size inside an obstacle; at the end none is "
-    "more than a tenth of the size inside; the kinetic, elastic and contact energy is never more than 1.05 times "
-    "that of the start. Or refused.",
+    "A cube of 0.4 m, E = 1e5 (waves ten times slower than the impact) to 1e9 Pa, flies at a plane and at the middle "
+    "of a sphere of radius 1 m, and the run lasts five times the flight through its own length. No boundary point "
+    "ever passes the sphere's centre or is more than the body's size inside an obstacle; at the end none is more than "
+    "a tenth of the size inside; the kinetic, elastic and contact energy is never more than 1.05 times that of the "
+    "start. Or refused.",
 )
 def impact(quick: bool) -> Iterator[Trial]:
     solvers: list[tuple[Solver, float | None]] = [(NEWTON, 2e-4), (NEWTON, 1.0 / 24.0), (VERLET, None)]

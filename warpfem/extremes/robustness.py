@@ -38,8 +38,8 @@ from warpfem.solvers import Solver
     "A body of 2 m with one such cell in its middle is let go from a stretch of 10 %. Implicit steps of 1 s: after 20 "
     "the elastic energy is below 1e-6 of the start, a strain of 1e-4; or refused in float32 below quality 1e-4, where "
     "displacements do not resolve the cell's height. Explicit steps of half the limit, which the cell sets, with "
-    "random velocities of 0.1 m/s, which make it quiver: in 400 of them the energy stays below the multiple of the start that "
-    "the scheme itself has, 3 for symplectic Euler, 4/3 for Verlet.",
+    "random velocities of 0.1 m/s, which make it quiver: in 400 of them the energy stays below the multiple of the "
+    "start that the scheme itself has, 3 for symplectic Euler, 4/3 for Verlet.",
 )
 def slivers(quick: bool) -> Iterator[Trial]:
     for setting, quality in product(settings(quick), (1e-3, 1e-6) if quick else (1e-3, 1e-4, 1e-5, 1e-6)):
@@ -103,8 +103,8 @@ def _bounded(label: str, setting: Setting, solver: Solver, mesh: Mesh) -> Trial:
 @case(
     20,
     "everything pinned, one element, zero gravity, zero frames",
-    "Everything pinned, under gravity: no displacement and no velocity at all after 5 steps. One element let go from a "
-    "stretch of 10 %: as a body with a sliver. Gravity of zero: the bits of a scene without. No frames: the initial "
+    "Everything pinned, under gravity: no displacement and no velocity at all after 5 steps. One element let go from "
+    "a stretch of 10 %: as a body with a sliver. Gravity of zero: the bits of a scene without. No frames: the initial "
     "one alone, without a step, also in a file.",
 )
 def degenerate(quick: bool) -> Iterator[Trial]:
