@@ -83,7 +83,7 @@ def _contrast_in_flight(label: str, setting: Setting, solver: Solver) -> Iterato
         return 0.01 * (x - x.mean(axis=0)) * setting.vector(0.0, 1.0)
 
     column = _column(setting, "bottom", 1e5, displacement=stretch)
-    frames, steps = 20, 50
+    frames, steps = 100, 10
     dt = 0.5 * stable_dt(setting, column, solver)
     simulation = setting.simulation([column], solver, dt, frames, steps)
     yield from _flight(label, simulation, frames * steps, energy_limit=0.1)
@@ -312,7 +312,7 @@ def long_flight(quick: bool) -> Iterator[Trial]:
             displacement=lambda x: 0.05 * (x - x.mean(axis=0)),
             velocity=motion,
         )
-        frames, steps = (20, 100) if quick else (100, 1000)
+        frames, steps = (100, 20) if quick else (200, 500)
         dt = 0.5 * stable_dt(setting, body, VERLET)
         simulation = setting.simulation([body], VERLET, dt, frames, steps)
         rotates = setting.material is not LinearElasticity
