@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from warpfem.supports import Supports
 
 Route = Literal["tape", "closed", "assembled"]
+
+STIFFNESS_PART = 16384
+"""Cells whose dense stiffness is held at a time: 19 MB for tetrahedra, where that of a million takes 1.2 GB."""
 
 
 class State:
@@ -164,12 +168,16 @@ class CellBlock:
             parameters,
         ]
 
-    def launch(self, name: str, inputs: list, outputs: list) -> None:
-        """Launches the kernel of that name over the cells, with those of :attr:`arguments` that it names first."""
+    def launch(self, name: str, inputs: list, outputs: list, *, part: slice | None = None) -> None:
+        """Launches the kernel of that name over the cells, or a part of them.
+
+        Of :attr:`arguments` it gets first those that it names.
+        """
         kernel = getattr(self.kernels, name)
-        known = dict(zip(("cells", "inverse_shape", "volume", "parameters"), self.arguments, strict=True))
+        arrays = self.arguments if part is None else [array[part] for array in self.arguments]
+        known = dict(zip(("cells", "inverse_shape", "volume", "parameters"), arrays, strict=True))
         own = [known[argument.label] for argument in kernel.adj.args if argument.label in known]
-        wp.launch(kernel, self.count, inputs=[*own, *inputs], outputs=outputs, device=self.device)
+        wp.launch(kernel, len(arrays[0]), inputs=[*own, *inputs], outputs=outputs, device=self.device)
 
 
 class Model:
@@ -260,12 +268,13 @@ class Model:
             return [float(np.max(body.material.moduli.p_wave)) for body in bodies]
         # from each cell's own stiffness: the uniform stretch u = X_x e_x has the energy V/2 d²psi/dF_xx²
         modulus = np.zeros(self.cell_count)
-        for block, stiffness in zip(self.blocks, self.element_stiffness(), strict=True):
-            edges = np.linalg.inv(block.arguments[1].numpy().astype(np.float64))  # columns X_k - X_0
-            stretch = np.zeros((block.count, self.dim + 1, self.dim))
+        for block, part, stiffness in self.element_stiffness_parts():
+            _, inverse_shape, volume, _ = block.arguments
+            edges = np.linalg.inv(inverse_shape.numpy()[part].astype(np.float64))  # columns X_k - X_0
+            stretch = np.zeros((len(edges), self.dim + 1, self.dim))
             stretch[:, 1:, 0] = edges[:, 0, :]
             work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
-            modulus[block.index] = work / block.arguments[2].numpy()
+            modulus[block.index[part]] = work / volume.numpy()[part]
         return [float(modulus[a:b].max()) for a, b in zip(self.cell_starts, self.cell_starts[1:], strict=False)]
 
     def _slip_speed(self) -> float:
@@ -410,17 +419,30 @@ class Model:
             For each block of :attr:`blocks` a float64 array (count, d+1, d, d+1, d) [N/m], indexed by
             point and component of the force, then of the displacement.
         """
+        parts: dict[CellBlock, list[np.ndarray]] = {block: [] for block in self.blocks}
+        for block, _, stiffness in self.element_stiffness_parts(u):
+            parts[block].append(stiffness)
+        return [np.concatenate(own) for own in parts.values()]
+
+    def element_stiffness_parts(self, u: wp.array | None = None) -> Iterator[tuple[CellBlock, slice, np.ndarray]]:
+        """:meth:`element_stiffness` a part of the cells at a time, which takes little memory.
+
+        Yields:
+            The block, the range of its cells, and their stiffness.
+        """
         if u is None:
             u = self.zeros()
         d, corners = self.dim, self.dim + 1
-        result = []
         for block in self.blocks:
-            slots = np.arange(block.count * corners**2, dtype=np.int32).reshape(block.count, corners, corners)
-            values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
-            block.launch("stiffness", [u, wp.array(slots, dtype=wp.int32, device=self.device)], [values])
-            entries = values.numpy().astype(np.float64).reshape(block.count, corners, corners, d, d)
-            result.append(entries.transpose(0, 1, 3, 2, 4))
-        return result
+            for start in range(0, block.count, STIFFNESS_PART):
+                part = slice(start, min(start + STIFFNESS_PART, block.count))
+                count = part.stop - start
+                slots = np.arange(count * corners**2, dtype=np.int32).reshape(count, corners, corners)
+                values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
+                slot_array = wp.array(slots, dtype=wp.int32, device=self.device)
+                block.launch("stiffness", [u, slot_array], [values], part=part)
+                entries = values.numpy().astype(np.float64).reshape(count, corners, corners, d, d)
+                yield block, part, entries.transpose(0, 1, 3, 2, 4)
 
     def stresses(self, state: State) -> Stresses:
         """Deformation gradients and stresses of every cell."""
