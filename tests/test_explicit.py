@@ -1,17 +1,21 @@
 """Explicit steps: the stability limit and its estimate, damping."""
 
+import re
+
 import numpy as np
 import pytest
 import warp as wp
 from helpers import irregular_mesh
 from stepping import EXPLICIT, MATERIALS, advance, dense_stiffness, mean, modes, ready, slab, solver_name
 
-from warpfem.boundary import BoxWalls, Pin, Plane
-from warpfem.errors import SimulationError
+from warpfem.boundary import BoxWalls, Pin, Plane, PrescribedMotion
+from warpfem.errors import SimulationError, TimeStepError
 from warpfem.materials import LinearElasticity, NeoHookean
 from warpfem.mesh import Mesh
 from warpfem.scene import Body, Scene
+from warpfem.simulation import Simulation
 from warpfem.solvers import SymplecticEuler, VelocityVerlet
+from warpfem.solvers.stability import Watch
 
 
 def irregular(dim, **settings):
@@ -46,6 +50,7 @@ def test_true_limit_separates_stable_from_unstable(solver, dim):
         noise = 1e-9 * rng.normal(size=irregular_mesh(dim).points.shape)  # small: about rest everything is linear
         model, state, stepper = ready(Scene([irregular(dim, velocity=noise)], solver))
         stepper._limit = np.inf  # the estimate is below the limit that is tried
+        stepper._look = lambda state, dt: None
         start = model.energies(state).total
         advance(stepper, state, fraction * 2.0 / modes(model)[0][-1], steps)
         return model.energies(state).total / start
@@ -66,6 +71,70 @@ def test_refuses_a_dt_above_the_limit(solver):
         assert number in str(error.value)
     np.testing.assert_array_equal(state.displacement, before)
     assert state.time == pytest.approx(0.999 * limit)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("solver", EXPLICIT, ids=solver_name)
+def test_an_unstable_run_is_stopped_within_some_steps(solver, dim):
+    noise = 1e-9 * np.random.default_rng(1).normal(size=irregular_mesh(dim).points.shape)
+    model, state, stepper = ready(Scene([irregular(dim, velocity=noise)], solver))
+    stepper._limit = np.inf  # as if the body had become stiffer since
+    true = 2.0 / modes(model)[0][-1]
+    with pytest.raises(TimeStepError, match="of the deformed bodies") as error:
+        advance(stepper, state, 1.05 * true, 20)  # the fastest mode grows by 1.88 a step
+    dt, limit = re.findall(r"([\d.]+) s[ :]", str(error.value))[1:3]
+    assert (float(dt), float(limit)) == pytest.approx((1.05 * true, true), rel=2e-3)
+    assert np.abs(state.velocity).max() < 1e-3
+
+
+@pytest.mark.parametrize("solver", EXPLICIT, ids=solver_name)
+def test_a_state_that_is_not_finite_is_named_at_the_next_step(solver):
+    _, state, stepper = ready(Scene([slab(2)], solver))
+    advance(stepper, state, 1e-4, 3)
+    velocity = state.velocity
+    velocity[4, 1] = np.nan
+    state.v.assign(velocity)
+    state.revision += 1
+    with pytest.raises(
+        SimulationError, match=r"t = 0\.0004 s: the displacement of point \d of body 'slab' is not finite"
+    ):
+        stepper.step(state, 1e-4)
+
+
+def test_energy_out_of_nothing_is_a_blow_up():
+    model, state, _ = ready(Scene([slab(2, velocity=(1.0, 0.0))], SymplecticEuler(), gravity=(0.0, -10.0)))
+    watch = Watch(model, state)
+    fallen = model.rest_points * 0.0 - [0.0, 5.0]
+    state.assign(displacement=fallen, velocity=np.broadcast_to([1.0, -10.0], fallen.shape))
+    watch.require_bounded(state, 1e-3)  # what gravity gave
+    state.assign(velocity=np.broadcast_to([200.0, -10.0], fallen.shape))
+    with pytest.raises(SimulationError, match="blown up: its energy has grown by .* fastest point is 0 of body 'slab'"):
+        watch.require_bounded(state, 1e-3)
+
+
+def squeezed(solver, dt):
+    """A block between plates that squeeze it to a quarter."""
+
+    def press(rest, time):
+        return rest * [1.0, 1.0 - 0.75 * min(time / 0.4, 1.0)]
+
+    body = slab(2, material=NeoHookean(E=1e7, nu=0.3), supports=[Pin("bottom"), PrescribedMotion("top", press)])
+    return Scene([body], solver, dt=dt, fps=50.0, frames=20)
+
+
+@pytest.mark.parametrize("solver", EXPLICIT, ids=solver_name)
+def test_the_limit_is_followed_as_the_body_deforms(solver):
+    limit = ready(squeezed(solver, "auto"))[2].stable_dt()
+    strained = Simulation(squeezed(solver, 0.99 * limit), dtype="float64")
+    with pytest.raises(TimeStepError, match="above the stability limit of the deformed bodies, 0.0"):
+        list(strained.frames())
+    assert 0.1 < strained.state.time < 0.4
+
+    simulation = Simulation(squeezed(solver, "auto"), dtype="float64")
+    frames = list(simulation.frames())
+    assert frames[-1].time == pytest.approx(0.4)
+    assert simulation.summary.dt < simulation.summary.stable_dt < 0.7 * limit
+    assert frames[-1].jacobian.min() == pytest.approx(0.25, rel=0.3)
 
 
 def test_contact_is_part_of_the_limit():

@@ -23,6 +23,9 @@ from warpfem.tensor import (
     volume_change,
 )
 
+_LARGE = 1e30
+"""What stands for a squared frequency that is not finite [1/s^2]."""
+
 Filter: TypeAlias = Literal["absolute", "clamped"]
 """What becomes of the negative eigenvalues of a cell's d²psi/dF²: their absolute values, or zero."""
 
@@ -303,6 +306,55 @@ class ElementKernels:
                         add_block(blocks_out, slots[i, b, a], wp.transpose(block))
 
         return filtered_element_stiffness
+
+    @functools.cached_property
+    def frequency(self) -> wp.Kernel:
+        """Raises ``square_out[0]`` to an estimate of the largest squared frequency of each cell alone [1/s^2].
+
+        By power iteration on the change of H: with lumped mass it is G -> (d + 1)/rho dP(G) sum_a b_a b_a^T. It
+        starts along the shortest height of the cell, where most cells are stiffest.
+        """
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        stress_differential = self.constitutive.stress_differential
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_frequency(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            parameters: wp.array(dtype=parameter_vector),
+            density: wp.array(dtype=scalar),
+            u: wp.array(dtype=vector),
+            square_out: wp.array(dtype=scalar),
+        ):
+            i = wp.tid()
+            B = inverse_shape[i]
+            H = displacement_gradient(u, cells[i], B)
+            first = vector()
+            Q = matrix()
+            for k in range(dim):
+                first = first + B[k]
+                Q += wp.outer(B[k], B[k])
+            Q += wp.outer(first, first)
+            scale = wp.trace(Q)
+            Q = Q / scale
+            G = Q
+            for k in range(dim):
+                G[k, (k + 1) % dim] += scalar(0.1)
+            size = scalar(0.0)
+            rounds = int(2)
+            for _round in range(rounds):
+                G = G / wp.sqrt(wp.ddot(G, G))
+                G = stress_differential(H, G, parameters[i]) * Q
+                size = wp.sqrt(wp.ddot(G, G))
+            square = (scalar(float(dim + 1)) * scale / density[i]) * size
+            if not (square < scalar(wp.static(_LARGE))):
+                square = scalar(wp.static(_LARGE))
+            wp.atomic_max(square_out, 0, square)
+
+        return element_frequency
 
     @functools.cached_property
     def step_limit(self) -> wp.Kernel:

@@ -13,13 +13,19 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import FloatName
-from warpfem.errors import SimulationError
+from warpfem.errors import SimulationError, TimeStepError
 from warpfem.model import Energies, Model
 from warpfem.scene import Scene
-from warpfem.solvers.base import Solver, require_finite
+from warpfem.solvers.base import Solver, require_finite, worst_cell
 
-AUTO_FRACTION = 0.5
-"""The part of the explicit stability limit at rest that ``dt="auto"`` takes: deformation stiffens cells."""
+AUTO_FRACTION = 0.6
+"""The part of the explicit stability limit that ``dt="auto"`` takes: deformation stiffens cells."""
+
+AUTO_INTERVAL = 32
+"""Explicit steps after which ``dt="auto"`` looks at the limit again."""
+
+LEAST_FRACTION = 1e-3
+"""The part of the first step of ``dt="auto"`` below which a run would hardly get on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +60,8 @@ class Summary:
     Attributes:
         frames: frames recorded, the initial one included.
         steps: time steps taken.
-        dt: time step [s].
+        dt: time step [s]; with ``dt="auto"`` the last one.
+        stable_dt: the explicit stability limit that ``dt="auto"`` saw last [s].
         simulated_seconds: simulated time [s].
         setup_seconds: wall time to build the model, and to compile or load its kernels [s].
         stepping_seconds: wall time of the steps [s].
@@ -73,6 +80,7 @@ class Summary:
 
     dt: float
     setup_seconds: float
+    stable_dt: float | None = None
     frames: int = 0
     steps: int = 0
     simulated_seconds: float = 0.0
@@ -129,8 +137,8 @@ class Simulation:
         model: the scene on the device.
         solver: the solver.
         state: the current state.
-        dt: the time step [s].
-        steps_per_frame: time steps between two frames.
+        dt: the time step [s]; explicit steps with ``dt="auto"`` change it as the bodies deform.
+        steps_per_frame: time steps between two frames, likewise.
         summary: what has been done so far.
 
     Raises:
@@ -152,22 +160,20 @@ class Simulation:
         self.state = self.model.state()
         self.solver = solver or scene.solver
         self.stepper = self.solver.stepper(self.model)
-        interval = 1.0 / scene.fps
         self._warned: set[str] = set()  # bodies whose inverted cells have been told of
-        self.steps_per_frame = max(1, math.ceil(interval / self._wanted_dt(interval) - 1e-9))
+        interval = 1.0 / scene.fps
+        self._rest_limit = self.stepper.stable_dt(self.state) if scene.dt == "auto" else None
+        wanted = scene.dt
+        if wanted == "auto":
+            wanted = interval if self._rest_limit is None else AUTO_FRACTION * self._rest_limit
+        self.steps_per_frame = max(1, math.ceil(interval / wanted - 1e-9))
         self.dt = interval / self.steps_per_frame
         if scene.frames > 0:
             self.stepper.prepare(self.state, self.dt)
         self._observe(0)
         self._first = 0
         self._begun = False
-        self.summary = Summary(self.dt, time.perf_counter() - start)
-
-    def _wanted_dt(self, interval: float) -> float:
-        if self.scene.dt != "auto":
-            return self.scene.dt
-        limit = self.stepper.stable_dt(self.state)
-        return interval if limit is None else AUTO_FRACTION * limit
+        self.summary = Summary(self.dt, time.perf_counter() - start, self._rest_limit)
 
     def restore(self, index: int, time: float, displacement: np.ndarray, velocity: np.ndarray) -> Frame:
         """Takes the state of an earlier run at a frame: :meth:`frames` then goes on with the next one.
@@ -209,13 +215,41 @@ class Simulation:
             yield frame
         for index in range(max(self._first, 1), self.scene.frames + 1):
             start = time.perf_counter()
-            for _ in range(self.steps_per_frame):
-                self._step()
+            self._advance(index / self.scene.fps)
             wp.synchronize_device(self.model.device)
             summary.stepping_seconds += time.perf_counter() - start
             frame = self._observe(index)
             summary.add_frame(frame)
             yield frame
+
+    def _advance(self, end: float) -> None:
+        """Steps to the end of a frame."""
+        if self._rest_limit is None:
+            for _ in range(self.steps_per_frame):
+                self._step()
+            return
+        summary, interval = self.summary, 1.0 / self.scene.fps
+        while (left := end - self.state.time) > 1e-9 * interval:
+            if summary.steps % AUTO_INTERVAL == 0:
+                self._follow_limit()
+            assert summary.stable_dt is not None
+            parts = math.ceil(left / (AUTO_FRACTION * summary.stable_dt) - 1e-9)
+            self.dt = summary.dt = left / parts
+            self.steps_per_frame = math.ceil(interval / self.dt - 1e-9)
+            self._step()
+
+    def _follow_limit(self) -> None:
+        """Estimates the stability limit again; it grows slowly, and never beyond that at rest."""
+        summary, rest = self.summary, self._rest_limit
+        here = self.stepper.estimate_stable_dt(self.state)
+        assert rest is not None and summary.stable_dt is not None and here is not None
+        summary.stable_dt = min(rest, here, 1.1 * summary.stable_dt)
+        if not summary.stable_dt > LEAST_FRACTION * rest:
+            raise TimeStepError(
+                f"t = {self.state.time:.6g} s: the stability limit of explicit steps has fallen to "
+                f"{summary.stable_dt:.3g} s, from {rest:.3g} s at the start: {worst_cell(self.model, self.state.u)}. "
+                "Take BackwardEuler, or meshes and materials that are squashed less"
+            )
 
     def _step(self) -> None:
         summary = self.summary

@@ -10,6 +10,14 @@ from warpfem.dtypes import types
 from warpfem.errors import SimulationError, TimeStepError
 from warpfem.model import Model, State
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, worst_cell
+from warpfem.solvers.stability import Watch, largest_frequency
+
+TRACKING_INTERVALS = (16, 256)
+"""Bounds of the steps after which the stability limit is estimated again, at the cost of some six steps: the fewer
+cells, the sooner a wave has crossed them, and the less it matters."""
+
+ALARM_INTERVAL = 16
+"""Steps after which a device other than the CPU is asked for alarms."""
 
 
 @functools.cache
@@ -25,42 +33,20 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
         kick: scalar,
         decay_after: scalar,
         drift: scalar,
+        watched_speed: scalar,
         u_out: wp.array(dtype=vector),
         v_out: wp.array(dtype=vector),
+        alarm_out: wp.array(dtype=wp.int32),
     ):
-        """v = decay_after (decay_before v + kick f / m), then u += drift v."""
+        """v = decay_after (decay_before v + kick f / m), then u += drift v; an alarm where |v| is not below a limit."""
         i = wp.tid()
         v = decay_after * (decay_before * v_out[i] + (kick * inverse_mass[i]) * force[i])
         v_out[i] = v
         u_out[i] += drift * v
+        if not (wp.length(v) <= watched_speed):
+            alarm_out[0] = 1
 
     return kick_drift
-
-
-def largest_frequency(model: Model, u: wp.array | None = None) -> float:
-    """An upper bound of the largest angular frequency [rad/s] of the model about ``u`` (default: at rest).
-
-    The largest eigenvalue of the cells' own (K_e, M_e) bounds that of the assembled pair (Irons and Treharne
-    1971). It is bounded in turn by (tr A^8)^(1/8), A = M_e^-1/2 K_e M_e^-1/2, which exceeds it by at most
-    (rank A)^(1/8): at rest 1.25 for tetrahedra and 1.15 for triangles, and so dt by at most 12 % and 7 %. Contact adds
-    the largest ratio of its stiffness to a point's mass.
-    """
-    corners = model.dim + 1
-    largest = 0.0
-    density = np.concatenate([np.broadcast_to(body.density, body.mesh.cell_count) for body in model.scene.bodies])
-    for block, part, stiffness in model.element_stiffness_parts(u):
-        volume = block.arguments[2].numpy()[part].astype(np.float64)
-        mass = density[block.index[part]] * volume / corners
-        A = stiffness.reshape(len(mass), corners * model.dim, -1) / mass[:, None, None]
-        scale = np.linalg.norm(A, axis=(1, 2))
-        A = A / np.where(scale > 0.0, scale, 1.0)[:, None, None]
-        A = A @ A
-        A = A @ A
-        bound = scale * np.linalg.norm(A, axis=(1, 2)) ** 0.25
-        largest = np.maximum(largest, bound.max())  # not a number stays
-    if model.contact is not None:
-        largest += model.contact.largest_stiffness_over_mass(model.host_mass)
-    return float(np.sqrt(largest))
 
 
 class _ExplicitStepper(Stepper):
@@ -70,9 +56,14 @@ class _ExplicitStepper(Stepper):
         self._force = model.zeros()
         self._rough = model.contact is not None and model.contact.rough
         self._limit: float | None = None
+        self._watch: Watch | None = None
+        self._watched_speed = 0.0
+        self._alarm = wp.zeros(1, dtype=wp.int32, device=model.device)
+        self._steps = 0
+        self._interval = int(np.clip(model.cell_count // 16, *TRACKING_INTERVALS))
 
     def arrays(self) -> list[wp.array]:
-        return [self._force]
+        return [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]
 
     def stable_dt(self, state: State | None = None) -> float:
         limit = 2.0 / largest_frequency(self.model)
@@ -86,14 +77,44 @@ class _ExplicitStepper(Stepper):
             )
         return min(limit, here)
 
+    def estimate_stable_dt(self, state: State) -> float:
+        if self._watch is None:
+            self._watch = Watch(self.model, state)
+        return self._watch.stable_dt(state.u)
+
+    def prepare(self, state: State, dt: float) -> None:
+        super().prepare(state, dt)
+        self._limit = self._watch = None
+        self._watched_speed, self._steps = 0.0, 0
+
     def _check_dt(self, state: State, dt: float) -> None:
         require_positive(dt)
         if self._limit is None:
             self._limit = self.stable_dt(state)
-        if dt > self._limit:
+        if self._watch is None:
+            self._watch = Watch(self.model, state)
+        if dt > self._limit and dt > 0.9 * self._watch.stable_dt(state.u):  # it may have grown since
             raise TimeStepError(
                 f"dt = {dt:.4g} s is above the stability limit of explicit steps in this scene, "
                 f'{self._limit:.4g} s: take a smaller dt, dt="auto", or BackwardEuler'
+            )
+
+    def _look(self, state: State, dt: float) -> None:
+        """Now and then, and where points have become faster than ever, looks whether the run is still stable."""
+        self._steps += 1
+        device = self.model.device
+        readable = device.is_cpu or self._steps % ALARM_INTERVAL == 0  # elsewhere reading waits for the device
+        if readable and self._alarm.numpy()[0]:
+            self._alarm.zero_()
+            self._watch.require_bounded(state, dt)
+            self._watched_speed = 2.0 * float(np.linalg.norm(state.velocity, axis=1).max())
+        elif self._steps % self._interval:
+            return
+        limit = self._watch.is_unstable(state, dt)
+        if limit is not None:
+            raise TimeStepError(
+                f"t = {state.time:.6g} s: dt = {dt:.4g} s is above the stability limit of the deformed bodies, "
+                f'{limit:.4g} s: take a smaller dt, dt="auto", or BackwardEuler'
             )
 
     def _kick_drift(
@@ -103,8 +124,16 @@ class _ExplicitStepper(Stepper):
         wp.launch(
             self._kernel,
             model.point_count,
-            inputs=[self._force, model.inverse_mass, decay_before, kick, decay_after, drift],
-            outputs=[state.u, state.v],
+            inputs=[
+                self._force,
+                model.inverse_mass,
+                decay_before,
+                kick,
+                decay_after,
+                drift,
+                self._watched_speed,
+            ],
+            outputs=[state.u, state.v, self._alarm],
             device=model.device,
         )
 
@@ -136,6 +165,7 @@ class _SymplecticEulerStepper(_ExplicitStepper):
         self._hold(state)
         state.time += dt
         state.revision += 1
+        self._look(state, dt)
         return StepReport()
 
 
@@ -164,6 +194,7 @@ class _VelocityVerletStepper(_ExplicitStepper):
         state.time += dt
         state.revision += 1
         self._known = (state, state.revision)
+        self._look(state, dt)
         return StepReport()
 
 
