@@ -23,13 +23,12 @@ from pathlib import Path
 
 import numpy as np
 
-from warpfem import child
 from warpfem.boundary import Plane, Sphere
 from warpfem.child import DAMAGED, limit_resources
 from warpfem.errors import WarpfemError
 from warpfem.mesh import Mesh
 
-PATIENCE = 10.0
+PATIENCE = 20.0
 """Seconds until a reader in a batch counts as hanging."""
 
 NUMBER = re.compile(rb"(?<![\w.])-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
@@ -331,7 +330,6 @@ def read_batch(reader: str, children: bool) -> None:
     report = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     warnings.simplefilter("ignore")
-    child.MIN_SECONDS = PATIENCE
     if not children:
         from warpfem import meshing
         from warpfem.usd import animation, meshes

@@ -117,7 +117,7 @@ def test_what_takes_too_long_is_ended(file: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_missing_file_starts_no_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child, "_ask", None)
-    for path in (tmp_path / "absent", tmp_path, "", "a" * 5000, "a\0b"):
+    for path in (tmp_path / "absent", "", "a" * 5000, "a\0b"):
         with pytest.raises(MeshError, match="no such file"):
             read_in_child(refuse, path, MeshError)
 

@@ -100,6 +100,11 @@ def test_default_output_is_named_after_the_scene(tmp_path, monkeypatch):
         (["run", BARS, "--set", "E=-1"], "E must be finite and > 0: got -1"),
         (["run", BARS, "--frames", "-1"], "frames must be an integer >= 0"),
         (["run", BARS, "--fps", "0"], "fps must be a finite number > 0"),
+        (["run", BARS, "--fps", "nan"], "fps must be a finite number > 0"),
+        (["run", BARS, "--fps", "1e308"], "fps must be a number between"),
+        (["run", BARS, "--set", "E=" + "9" * 400], "E must be of type float"),
+        (["run", BARS, "--set", "cells=" + "[" * 5000], "cells must be of type int"),
+        (["run", "a" * 5000 + ".py"], "no scene file"),
         (["run", BARS, "--device", "gpu"], "no device 'gpu'"),
         (["run", BARS, "--out", "/dev/null/a.usdc"], "/dev/null"),
         (["run", BARS, "--out", "a.txt"], "a.txt"),
@@ -129,6 +134,11 @@ def test_wrong_use_is_one_message_and_no_file(tmp_path, monkeypatch, capsys, arg
         ("def scene(cells):\n    return cells\n", "give it with --set cells=VALUE"),
         ("raise SystemExit(3)\n", "line 2"),
         ("def scene():\n\n    return 1 / 0\n", "ZeroDivisionError: division by zero"),
+        ("def scene():\n    return scene()\n", "RecursionError"),
+        ("scene = dict\n", "scene must be a function scene(**parameters) -> Scene"),
+        ("class Odd(BaseException):\n    pass\n\ndef scene():\n    raise Odd('hm')\n", "Odd: hm"),
+        ("def scene():\n    raise ValueError('one\\ntwo')\n", "ValueError: one two ("),
+        ("class E(Exception):\n    def __str__(self):\n        return 1 / 0\n\nraise E\n", "E: without a text"),
     ],
 )
 def test_errors_in_a_scene_file_name_file_and_line(scene_file, capsys, body, message):
@@ -138,6 +148,26 @@ def test_errors_in_a_scene_file_name_file_and_line(scene_file, capsys, body, mes
     assert path in printed or "at least one" in message
     assert message in printed
     assert "Traceback" not in printed
+
+
+@pytest.mark.parametrize("content", [b"", b"\0\1\2", b"# \xe9\n", "x = 1".encode("utf-16"), b"# coding: odd\n", None])
+@pytest.mark.parametrize("command", ["run", "explain"])
+def test_a_scene_file_that_is_none_is_one_line(tmp_path, capsys, command, content):
+    path = tmp_path / "odd.py"
+    path.mkdir() if content is None else path.write_bytes(content)
+    assert main([command, str(path)]) == WRONG_USE
+    printed = capsys.readouterr().err
+    assert printed.startswith("warpfem: ") and str(path) in printed and printed.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["a.usdc", "a.usda", "a.usdz", "a.png", "a"])
+def test_a_preview_of_garbage_is_one_line(tmp_path, capfd, name):
+    pytest.importorskip("matplotlib")
+    path = tmp_path / name
+    path.write_bytes(b"PXR-USDC" + bytes(range(200)))
+    assert main(["preview", str(path), "--out", str(tmp_path / "out.png")]) == WRONG_USE
+    printed = capfd.readouterr().err
+    assert printed.startswith("warpfem: ") and str(path) in printed and printed.count("\n") == 1
 
 
 DIVERGING = """

@@ -8,7 +8,7 @@ import pytest
 
 from warpfem.errors import MeshError, MissingExtraError
 from warpfem.mesh import Mesh
-from warpfem.meshing import read_mesh, read_surface, tetrahedralize
+from warpfem.meshing import read_mesh, read_solid_file, read_surface, tetrahedralize
 
 BOX = Mesh.box((1.0, 2.0, 1.0), (2, 3, 2))
 RECTANGLE = Mesh.rectangle((2.0, 1.0), (3, 2))
@@ -257,8 +257,10 @@ def test_a_truncated_file_is_never_read_as_a_mesh(tmp_path, capfd, name, argumen
     last = content.rfind(b"$End") + 4 if path.suffix == ".msh" else content.rfind(b"</VTKFile>")
     for length in {*np.linspace(0, last, 60, dtype=int), *range(last - 25, last + 1)}:
         path.write_bytes(content[:length])
-        with pytest.raises(MeshError, match=path.name):
-            read_mesh(path)
+        with pytest.raises(MeshError):
+            Mesh.repaired(*read_solid_file(str(path)))  # as read_mesh does, without a process for each
+    with pytest.raises(MeshError, match=path.name):
+        read_mesh(path)
     assert capfd.readouterr() == ("", "")
 
 
@@ -407,3 +409,21 @@ def test_a_package_that_lacks_one_of_its_own_names_that(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "pytetwild", raising=False)
     with pytest.raises(MissingExtraError, match=r"'lacking': pip install 'warpfem\[tet\]'"):
         tetrahedralize(*CUBE)
+
+
+# ---- what is in a file decides nothing about this process
+
+
+def test_a_count_that_lies_takes_no_memory(tmp_path):
+    pytest.importorskip("meshio")
+    path = tmp_path / "lie.msh"
+    path.write_text(GMSH_22.replace("$Nodes\n6\n", "$Nodes\n999999999999\n"))
+    with pytest.raises(MeshError, match=r"lie\.msh: .*damaged"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("read", [read_mesh, read_surface])
+@pytest.mark.parametrize("path", [None, 0, 1.5, b"a.msh", ["a.msh"], "", "a" * 5000 + ".msh", "a\0.msh"], ids=repr)
+def test_odd_names_are_refused(read, path):
+    with pytest.raises(MeshError, match=r"no such file|the name of a file must be"):
+        read(path)

@@ -25,6 +25,7 @@ from warpfem.usd import (
     ColorScale,
     UsdBody,
     UsdWriter,
+    animation,
     read_animation,
     read_surface_mesh,
     read_tet_mesh,
@@ -979,3 +980,60 @@ def test_other_files_are_no_animations(tmp_path: Path) -> None:
     (tmp_path / "b.usdc").write_bytes(b"PXR-USDC")
     with pytest.raises(OutputError, match=r"b\.usdc cannot be read as USD"):
         read_animation(tmp_path / "b.usdc")
+
+
+def test_a_file_is_read_through_in_a_child_unless_it_is_known(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "run.usdc"
+    probed: list[str] = []
+    read_in_child = animation.read_in_child
+    monkeypatch.setattr(animation, "read_in_child", lambda *a: probed.append(str(a[1])) or read_in_child(*a))
+    write(path, [make_body(2)], 3)
+    assert read_animation(path).frame_count == 3
+    assert not probed  # this process wrote it
+    os.utime(path, ns=(1, 1))
+    for _ in range(2):
+        assert read_animation(path).frame_count == 3
+    assert probed == [str(path)]  # once
+    with path.open("ab") as file:
+        file.write(b" ")
+    read_animation(path)
+    assert len(probed) == 2
+
+
+def test_damage_in_a_chunk_of_a_known_partial_file_is_found(tmp_path: Path) -> None:
+    body = make_body(2)
+    writer = UsdWriter(tmp_path / "run.usdc", [body], fps=24, frames_per_chunk=2)
+    for index in range(4):
+        writer.write_frame([make_frame(body, index)])
+    partial = tmp_path / "run.partial.usda"
+    assert read_animation(partial).frame_count == 4
+    chunk = tmp_path / "run.partial" / "000002.usdc"
+    for content in (chunk.read_bytes()[:-40], b"", None):
+        if content is None:
+            chunk.unlink()
+        else:
+            chunk.write_bytes(content)
+        with pytest.raises(OutputError, match=r"run\.partial\.usda"):
+            read_animation(partial)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("framesPerSecond = 25", "framesPerSecond = 0"),
+        ("framesPerSecond = 25", "framesPerSecond = -3"),
+        ("double2 colorRange = (", "double2 colorRange = (inf, 1) # "),
+        ('colorBy = "von_mises"', 'colorBy = "taste"'),
+        ("point3f[] points = [(", "point3f[] points = [(nan, 0, 0), ("),
+        ("int[] faceVertexIndices = [0,", "int[] faceVertexIndices = [99,"),
+        ("float[] primvars:J.timeSamples = {\n                0: [", "float[] primvars:J.timeSamples = {\n 0: [1, "),
+    ],
+)
+def test_an_animation_that_makes_no_sense_is_an_error(tmp_path: Path, old: str, new: str) -> None:
+    path = tmp_path / "run.usda"
+    write(path, [make_body(2)], 2)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(OutputError, match=r"run\.usda"):
+        read_animation(path)
