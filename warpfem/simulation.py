@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -99,6 +100,15 @@ class Summary:
         self.smallest_jacobian = min(self.smallest_jacobian, float(frame.jacobian.min()))
         self.largest_penetration = max(self.largest_penetration, frame.penetration)
 
+    def totals(self) -> dict[str, Any]:
+        """What a run that is taken up again has to know, in plain numbers and texts."""
+        return {name: value for name, value in asdict(self).items() if name != "setup_seconds"}
+
+    def take_up(self, totals: Mapping[str, Any]) -> None:
+        """Goes on from the totals of an earlier run."""
+        for name, value in totals.items():
+            setattr(self, name, Energies(**value) if isinstance(value, Mapping) else value)
+
 
 class Simulation:
     """A scene on a device, ready to run.
@@ -147,6 +157,8 @@ class Simulation:
         if scene.frames > 0:
             self.stepper.prepare(self.state, self.dt)
         self._observe(0)
+        self._first = 0
+        self._begun = False
         self.summary = Summary(self.dt, time.perf_counter() - start)
 
     def _wanted_dt(self, interval: float) -> float:
@@ -155,19 +167,45 @@ class Simulation:
         limit = self.stepper.stable_dt(self.state)
         return interval if limit is None else AUTO_FRACTION * limit
 
+    def restore(self, index: int, time: float, displacement: np.ndarray, velocity: np.ndarray) -> Frame:
+        """Takes the state of an earlier run at a frame: :meth:`frames` then goes on with the next one.
+
+        On the CPU the frames are the same as without the interruption, to the last bit: all that a frame's steps
+        depend on is the state at its start.
+
+        Args:
+            index: index of the frame.
+            time: its time [s], as the earlier run counted it.
+            displacement, velocity: (point_count, dim) [m] and [m/s].
+
+        Returns:
+            That frame.
+
+        Raises:
+            SimulationError: the arrays do not fit the scene.
+        """
+        self.state.assign(displacement=displacement, velocity=velocity)
+        self.state.time = time
+        self._first = index + 1
+        return self._observe(index)
+
     def frames(self) -> Iterator[Frame]:
         """Runs the scene, once; yields the initial state and then one frame per frame interval.
+
+        After :meth:`restore` the first one is that after the restored frame.
 
         Raises:
             SimulationError: the run cannot go on, or has been started before. The frames yielded so far are good.
         """
         summary = self.summary
-        if summary.frames:
+        if self._begun:
             raise SimulationError("this simulation has been run: make another one to run the scene again")
-        frame = self._observe(0)
-        summary.add_frame(frame)
-        yield frame
-        for index in range(1, self.scene.frames + 1):
+        self._begun = True
+        if self._first == 0:
+            frame = self._observe(0)
+            summary.add_frame(frame)
+            yield frame
+        for index in range(max(self._first, 1), self.scene.frames + 1):
             start = time.perf_counter()
             for _ in range(self.steps_per_frame):
                 self._step()

@@ -61,4 +61,4 @@ class NeoHookean(HookeanMaterial):
 
     name = "neo_hookean"
     least_nu = 0.0
-    functions = Constitutive(energy_density, stress, stress_differential)
+    functions = Constitutive(energy_density, stress, stress_differential, barrier=True)
