@@ -65,6 +65,7 @@ class Summary:
         largest_penetration: over all frames [m].
         newton_iterations, cg_iterations: totals over all steps.
         rounded_steps: implicit steps that rounding kept from their tolerance, with a residual below 1e-2.
+        divided_steps: implicit steps that failed as a whole and were taken in parts.
         unconverged_steps: implicit steps that stopped before their tolerance for other reasons, or above 1e-2.
         worst_residual: the largest relative residual among both.
         worst_note: how that step ended.
@@ -85,6 +86,7 @@ class Summary:
     newton_iterations: int = 0
     cg_iterations: int = 0
     rounded_steps: int = 0
+    divided_steps: int = 0
     unconverged_steps: int = 0
     worst_residual: float = 0.0
     worst_note: str = ""
@@ -222,6 +224,7 @@ class Simulation:
         summary.simulated_seconds = self.state.time
         summary.newton_iterations += report.newton_iterations
         summary.cg_iterations += report.cg_iterations
+        summary.divided_steps += report.parts > 1
         if report.note:
             summary.rounded_steps += report.converged
             summary.unconverged_steps += not report.converged
