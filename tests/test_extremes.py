@@ -3,12 +3,17 @@
 import json
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from warpfem.cli import FAILED, OK, WRONG_USE, main
 from warpfem.errors import MaterialError, SimulationError
 from warpfem.extremes import CASES, Case, Trial, report
+from warpfem.extremes.recovery import block, jacobians, misfit, released, with_one_inverted
+from warpfem.extremes.subjects import rotation
 from warpfem.extremes.table import at_most, attempted, refused
+from warpfem.materials import StVenantKirchhoff
+from warpfem.simulation import Simulation
 
 
 @pytest.mark.parametrize("number", sorted(CASES))
@@ -44,6 +49,40 @@ def test_a_refusal_where_none_is_allowed_fails():
 
     assert attempted("a", diverge) == Trial("a", "FAIL", "stopped", "SimulationError: t = 1 s: diverged")
     assert attempted("a", lambda: Trial("a", "pass")).status == "pass"
+
+
+# ---- recovery
+
+
+def test_misfit_is_free_of_rigid_motion_but_not_of_mirroring():
+    mesh = block(3, quick=True)
+    x = mesh.points
+    turned = x @ rotation(np.ones(3), 2.0).T + (3.0, 0.0, 1.0)
+    assert misfit(x, turned - x, linear=False) < 1e-14
+    assert (
+        misfit(x, x @ rotation(np.ones(3), 0.1).T - x, linear=True) > 1e-3
+    )  # a rotation is none for linear elasticity
+    assert misfit(x, np.cross((0.0, 0.1, 0.2), x), linear=True) < 1e-14
+    assert misfit(x, -2.0 * x * (1.0, 0.0, 0.0), linear=False) > 0.5
+    assert misfit(x, 0.01 * x, linear=False) == pytest.approx(0.01 * np.sqrt(0.75))
+
+
+def test_a_body_that_rests_elsewhere_is_refused_only_with_a_warning(monkeypatch):
+    mesh = block(2, quick=True)
+    mirrored = mesh.points * (-1.0, 1.0)
+    trial = released("mirrored", mesh, StVenantKirchhoff(1e5, 0.3), "float64", mirrored)
+    assert trial.status == "refused"
+    assert "StVenantKirchhoff does not turn them back" in trial.note
+    monkeypatch.setattr(Simulation, "_warn_of_inverted_cells", lambda *_: None)
+    trial = released("mirrored", mesh, StVenantKirchhoff(1e5, 0.3), "float64", mirrored)
+    assert trial.status == "FAIL"
+    assert "at rest, 8 of 8 cells inverted" in trial.note
+
+
+def test_starts_are_what_they_are_called():
+    mesh = block(3, quick=True)
+    assert (jacobians(mesh, with_one_inverted(mesh)) < 0.0).sum() == 1
+    assert (jacobians(mesh, mesh.points * (-1.0, 1.0, 1.0)) < 0.0).all()
 
 
 # ---- reports

@@ -303,7 +303,11 @@ class Simulation:
                     f"t = {self.state.time:.6g} s: {len(inverted)} of {body.mesh.cell_count} cells of body "
                     f"'{body.name}' are inverted (the first is cell {inverted[0]}, J = "
                     f"{jacobian[cells][inverted[0]]:.4g}): "
-                    + ("it may fold" if body.material.resists_mirroring else f"{kind} does not turn them back"),
+                    + (
+                        "the body may come to rest folded"
+                        if body.material.resists_mirroring
+                        else f"{kind} does not turn them back"
+                    ),
                     stacklevel=2,
                 )
 
