@@ -20,7 +20,7 @@ $(VENV)/extras: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[tet]' && touch $@ || true
 
 demo: $(VENV)/extras
-	$(BIN)/warpfem run scenes/bear.py --out output/bear.usdc
+	$(BIN)/warpfem run scenes/bear.py --out output/bear.usdc --overwrite
 	-$(BIN)/warpfem preview output/bear.usdc --out output/bear.png
 	@echo
 	@echo "The animation: $(CURDIR)/output/bear.usdc (open it in Blender with File > Import > Universal Scene Description)"

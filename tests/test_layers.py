@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "warpfem"
 
 LAYERS = [
     {"errors"},
-    {"tensor", "dtypes", "boundary", "moduli", "profiling"},
+    {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child"},
     {"mesh", "points"},
     {"materials"},
     {"elements", "meshing"},
@@ -19,8 +19,9 @@ LAYERS = [
     {"linear"},
     {"solvers"},
     {"simulation"},
-    {"usd"},
+    {"usd", "checkpoint", "failure"},
     {"record", "explain", "scene_file", "preview"},
+    {"extremes"},
     {"cli"},
     {"__main__"},
 ]

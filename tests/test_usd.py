@@ -6,6 +6,7 @@ import itertools
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -499,7 +500,7 @@ def fail_to_move(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
             raise OSError("no space left")
         REPLACE(source, target)
 
-    monkeypatch.setattr("warpfem.usd.chunks.os.replace", replace)
+    monkeypatch.setattr("warpfem.files.os.replace", replace)
 
 
 REPLACE = os.replace
@@ -512,7 +513,7 @@ def test_frames_that_could_not_be_saved_are_saved_later(tmp_path: Path, monkeypa
     writer = UsdWriter(tmp_path / "run.usdc", [body], fps=24, frames_per_chunk=2)
     for frame in frames[:3]:
         writer.write_frame([frame])
-    with monkeypatch.context() as patch, pytest.raises(OutputError, match=r"run\.usdc cannot be written: no space"):
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match=r"run\.usdc cannot be written .*: no space"):
         fail_to_move(patch, name)
         writer.write_frame([frames[3]])
     assert (tmp_path / "run.partial" / "000002.usdc").exists() == (name != "000002.usdc")
@@ -534,7 +535,7 @@ def test_a_failed_merge_keeps_the_old_output_the_frames_and_the_first_error(tmp_
             writer.write_frame([make_frame(body, 0)])
             raise RuntimeError("diverged")
     (note,) = caught.value.__notes__
-    assert f"cannot be written (the frames are in {tmp_path / 'run.partial.usda'})" in note
+    assert f"cannot be written (what was saved of its frames is in {tmp_path / 'run.partial.usda'})" in note
     assert_sound(path, 2)
     assert_sound(tmp_path / "run.partial.usda", 1)
     assert not (tmp_path / "run.partial" / "merged.usdc").exists()
@@ -614,8 +615,110 @@ def test_a_full_disk_loses_no_frames(tmp_path: Path) -> None:
     command = [sys.executable, "-c", code, str(tmp_path / "run.usdc")]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     *message, partial, complete = result.stdout.splitlines()
-    assert "cannot be written (the frames are in" in message[0] and "run.partial.usda" in message[0]
+    assert "cannot be written (what was saved of its frames is in" in message[0] and "run.partial.usda" in message[0]
     assert (partial, complete) == ("20", "20")
+
+
+FULL_CHUNK = """
+import resource, signal, sys
+sys.path[:0] = [{repository!r}, {tests!r}]
+from test_usd import UsdWriter, make_body, make_frame
+from warpfem.usd import partial_path, read_animation
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+path, limit = sys.argv[1], int(sys.argv[2])
+body = make_body(3)
+try:
+    with UsdWriter(path, [body], fps=24, frames_per_chunk=4) as writer:
+        for index in range(20):
+            if index == 11:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+            writer.write_frame([make_frame(body, index)])
+except OSError as error:
+    print(index, error, getattr(error, "__notes__", []))
+print(read_animation(partial_path(path)).frame_count, sorted(file.name for file in writer._layer._folder.iterdir()))
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+print(read_animation(writer.close()).frame_count)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
+@pytest.mark.parametrize("limit", [500, 8192])
+def test_a_disk_that_fills_up_during_a_run_ends_it_with_one_error(tmp_path: Path, limit: int) -> None:
+    """The chunk, or what joins the chunks, is cut off in the middle of writing: what was saved stays sound."""
+    code = FULL_CHUNK.format(repository=str(REPOSITORY), tests=str(REPOSITORY / "tests"))
+    command = [sys.executable, "-c", code, str(tmp_path / "run.usdc"), str(limit)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    message, partial, complete = result.stdout.splitlines()
+    assert re.fullmatch(r"11 .*run\.usdc cannot be written \(.*run\.partial\.usda\): .*File too large \[\]", message)
+    assert partial == "8 ['000000.usdc', '000004.usdc', 'manifest.usdc', 'static.usdc']"
+    assert complete == "12"  # once there is room again, also the frames that waited
+
+
+def test_a_disk_without_room_is_said_at_once(tmp_path: Path, monkeypatch) -> None:
+    body, path = make_body(3), tmp_path / "run.usdc"
+    write(path, [body], 40)
+    needed = 2 * path.stat().st_size  # in parts and merged
+    left = UsdWriter(path, [body], fps=24, frames_per_chunk=1)
+    left.write_frame([make_frame(body, 0)])
+    before = {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()}
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("warpfem.usd.writer.shutil.disk_usage", lambda folder: usage._replace(free=int(0.7 * needed)))
+    with pytest.raises(OutputError, match=r"its 40 frames need \d[\d.]* MB .* has \d[\d.]* MB free: take another"):
+        UsdWriter(path, [body], fps=24, expected_frames=40)
+    assert {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()} == before
+    UsdWriter(path, [body], fps=24, expected_frames=20).close()
+    with pytest.raises(OutputError, match="its 20 frames need"):
+        UsdWriter(path.with_suffix(".usda"), [body], fps=24, expected_frames=20)  # text is larger
+
+
+def test_a_folder_that_is_removed_ends_the_run(tmp_path: Path) -> None:
+    body, folder = make_body(2), tmp_path / "folder"
+    message = r"run\.usdc cannot be written: .*run\.partial has been removed, with the frames in it"
+    with (
+        pytest.raises(OutputError, match=message) as caught,
+        UsdWriter(folder / "run.usdc", [body], fps=24, frames_per_chunk=1) as writer,
+    ):
+        writer.write_frame([make_frame(body, 0)])
+        shutil.rmtree(folder)
+        writer.write_frame([make_frame(body, 1)])
+    assert not hasattr(caught.value, "__notes__")
+    assert not folder.exists()
+
+
+def test_waiting_frames_can_be_saved_at_once(tmp_path: Path) -> None:
+    body = make_body(2)
+    with UsdWriter(tmp_path / "run.usdc", [body], fps=24, frames_per_chunk=50) as writer:
+        for index in range(4):
+            writer.write_frame([make_frame(body, index)])
+            assert read_animation(tmp_path / "run.partial.usda").frame_count == max(0, index)
+            writer.flush()
+            writer.flush()
+            assert read_animation(tmp_path / "run.partial.usda").frame_count == index + 1
+    assert_sound(tmp_path / "run.usdc", 4)
+
+
+@pytest.mark.parametrize("source", ["partial", ".usdc", ".usda"])
+@pytest.mark.parametrize("per_chunk", [1, 4])
+def test_a_writer_keeps_frames_of_an_earlier_one(tmp_path: Path, source: str, per_chunk: int) -> None:
+    """Also the largest stress, which is in an early frame, and drops the frames after the last one kept."""
+    body = make_body(3)
+    path = tmp_path / ("run.usdc" if source == "partial" else f"run{source}")
+    whole = write(tmp_path / f"whole{path.suffix}", [body], 9)
+    earlier = UsdWriter(path, [body], fps=25.0, frames_per_chunk=per_chunk)
+    for frame in (*whole[:5], *whole[:2]):
+        earlier.write_frame(frame)
+    earlier.flush() if source == "partial" else earlier.close()
+    with UsdWriter(path, [body], fps=25.0, frames_per_chunk=3, keep=(4, whole[4])) as writer:
+        kept = read_animation(tmp_path / "run.partial.usda")
+        assert kept.frame_count == 5
+        assert kept.scale == read_animation(tmp_path / f"whole{path.suffix}").scale
+        assert np.array_equal(kept.frame(2)[0].points, whole[2][0].points.astype(np.float32))
+        assert_sound(tmp_path / "run.partial.usda", 5)
+        for frame in whole[5:]:
+            writer.write_frame(frame)
+    written, expected = (Sdf.Layer.OpenAsAnonymous(str(tmp_path / f"{name}{path.suffix}")) for name in ("run", "whole"))
+    assert written.ExportToString() == expected.ExportToString()
 
 
 @pytest.mark.parametrize(
@@ -661,6 +764,13 @@ def test_outputs_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> N
         (tmp_path / "folder.usdc", "is a folder"),
         (tmp_path / "file" / "run.usdc", "cannot be written"),
         (Path("/proc/run.usdc"), "cannot be written"),
+        (tmp_path / "file" / "folder" / "run.usdc", "file is not a folder that can be written to"),
+        (tmp_path / ("x" * 300 + ".usdc"), "File name too long"),
+        (tmp_path / ("x" * 240 + ".usdc"), "File name too long"),  # that of the partial file would be
+        (tmp_path / "back\\slash" / "run.usdc", r"USD does not bear '\\\\' in the name"),
+        (tmp_path / "new\nline.usdc", r"USD does not bear '\\n' in the name"),
+        (tmp_path / os.fsdecode(b"\xff.usdc"), "USD does not bear bytes that are not UTF-8"),
+        (tmp_path / "a:SDF_FORMAT_ARGS:b.usdc", "USD does not bear ':SDF_FORMAT_ARGS:'"),
     ):
         with pytest.raises(OutputError, match=message):
             UsdWriter(path, [body], fps=24)
@@ -677,6 +787,52 @@ def test_outputs_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> N
     with pytest.raises(OutputError, match="no bodies"):
         UsdWriter(tmp_path / "run.usdc", [], fps=24)
     assert {item.name for item in tmp_path.iterdir()} == {"folder.usdc", "file"}
+
+
+@pytest.mark.parametrize(
+    "name", ["a b", "q'\"", "at@@@", "[x]", "é中", "100%20", "<UDIM>", "${X}", "`x`", "-x", "~", "*", "{}"]
+)
+def test_odd_names_are_borne(tmp_path: Path, name: str) -> None:
+    body, path = make_body(2), tmp_path / name / f"{name}.usdc"
+    with UsdWriter(path, [body], fps=24, frames_per_chunk=2) as writer:
+        for index in range(3):
+            writer.write_frame([make_frame(body, index)])
+        assert_sound(path.with_name(f"{name}.partial.usda"), 2)
+    assert_sound(path, 3)
+
+
+PROTECTED = """
+import os, sys
+sys.path[:0] = [{repository!r}]
+from warpfem.usd import check_path
+
+if os.getuid() == 0:
+    os.setuid(65534)  # nothing is denied to root
+for path in sys.argv[1:]:
+    try:
+        check_path(path)
+    except OSError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="permissions as POSIX has them")
+def test_what_is_write_protected_is_refused(tmp_path: Path) -> None:
+    file, folder, free = tmp_path / "file.usdc", tmp_path / "folder", tmp_path / "free.usdc"
+    file.touch()
+    file.chmod(0o444)
+    folder.mkdir()
+    folder.chmod(0o555)
+    for parent in (tmp_path, *tmp_path.parents):
+        if parent.owner() == tmp_path.owner() and "pytest" in str(parent):
+            parent.chmod(0o777)
+    code = PROTECTED.format(repository=str(REPOSITORY))
+    command = [sys.executable, "-c", code, str(file), str(folder / "run.usdc"), str(free)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines() == [
+        f"{file} cannot be written: it is write-protected",
+        f"{folder / 'run.usdc'} cannot be written: {folder} is not a folder that can be written to",
+    ]
 
 
 def test_bodies_that_contradict_themselves_are_refused(tmp_path: Path) -> None:

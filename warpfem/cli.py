@@ -16,11 +16,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import warpfem
-from warpfem.errors import SimulationError, TimeStepError, WarpfemError
+from warpfem.checkpoint import Checkpoint, checkpoint_path
+from warpfem.errors import OutputError, SimulationError, TimeStepError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 
 OK, FAILED, WRONG_USE = 0, 1, 2
+
+STABILITY_PAGE = Path("docs") / "stability.md"
 
 EXTRAS = {
     "meshio": "mesh",
@@ -64,6 +67,15 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="run a scene file and store the animation", description=_run.__doc__)
     _scene_options(run)
     run.add_argument("--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.usdc)")
+    run.add_argument(
+        "--checkpoint-every",
+        type=_positive,
+        metavar="N",
+        help="write a checkpoint beside the output every N frames, to resume a killed or interrupted run from",
+    )
+    existing = run.add_mutually_exclusive_group()
+    existing.add_argument("--resume", action="store_true", help="go on after the last checkpoint of the same run")
+    existing.add_argument("--overwrite", action="store_true", help="replace an output that exists, without asking")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     run.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else")
     run.set_defaults(command=_run)
@@ -83,9 +95,35 @@ def _parser() -> argparse.ArgumentParser:
     )
     preview.set_defaults(command=_preview)
 
+    extremes = commands.add_parser(
+        "extremes", help="measure the stability of warpfem at the extremes", description=_extremes.__doc__
+    )
+    extremes.add_argument("--quick", action="store_true", help="few settings and small meshes, about two minutes")
+    extremes.add_argument("--json", action="store_true", help="print the results as JSON, and nothing else")
+    extremes.add_argument(
+        "--case", type=int, nargs="+", default=[], metavar="N", help="only the cases of these numbers"
+    )
+    extremes.add_argument(
+        "--out",
+        type=Path,
+        metavar="F",
+        help=f"Markdown file of all figures (default: {STABILITY_PAGE}, if neither --quick nor --case is given)",
+    )
+    extremes.set_defaults(command=_extremes)
+
     info = commands.add_parser("info", help="print versions and devices", description=_info.__doc__)
     info.set_defaults(command=_info)
     return parser
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
+    return number
+
+
+_positive.__name__ = "number of frames"  # argparse's name for what is no number
 
 
 def _scene_options(parser: argparse.ArgumentParser) -> None:
@@ -136,30 +174,39 @@ def _start_warp() -> None:
 
 @contextmanager
 def _held_interrupt() -> Iterator[Callable[[], None]]:
-    """Holds back the first Ctrl-C until the function that it gives is called; a second one stops at once.
+    """Holds back the first Ctrl-C or SIGTERM until the function that it gives is called; a second one stops at once.
 
     Raised just anywhere, the interrupt would be lost in the import of the USD libraries or in a destructor.
     """
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     seen = []
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     def note(*_: object) -> None:
         seen.append(True)
-        signal.signal(signal.SIGINT, before)
+        restore()
 
     def check() -> None:
         if seen:
             raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, note)
+    for number in before:
+        signal.signal(number, note)
     try:
         yield check
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Runs a scene file and stores the animation in a USD file, frame by frame."""
+    """Runs a scene file and stores the animation in a USD file, frame by frame.
+
+    An output that exists is replaced only with --overwrite or after asking. The first Ctrl-C (or SIGTERM) ends the
+    run after the frame, a second one at once.
+    """
     _start_warp()
     scene = _load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
@@ -167,6 +214,10 @@ def _run(arguments: argparse.Namespace) -> int:
         from warpfem.usd import check_path
     check_interrupt()
     check_path(out)
+    if arguments.resume:
+        Checkpoint.read(checkpoint_path(out))  # said before preparing
+    elif not arguments.overwrite:
+        _require_consent(out)
     say = not (arguments.quiet or arguments.json)
     if say:
         print(f"{arguments.scene}: preparing (the first run of a scene compiles its kernels)", file=sys.stderr)
@@ -174,15 +225,20 @@ def _run(arguments: argparse.Namespace) -> int:
     summary = simulation.summary
     code = OK
     try:
-        with _held_interrupt() as check_interrupt, closing(warpfem.record(simulation, out)) as frames:
+        recording = warpfem.record(
+            simulation, out, checkpoint_every=arguments.checkpoint_every, resume=arguments.resume
+        )
+        with _held_interrupt() as check_interrupt, closing(recording) as frames:
             for _ in _progress(frames, scene.frames + 1) if say else frames:
                 check_interrupt()
     except KeyboardInterrupt:
-        code = _fail(SimulationError(f"interrupted: {_kept(summary, out)}"), FAILED)
+        if not summary.frames:
+            raise
+        code = _fail(SimulationError(f"interrupted: {_kept(out)}"), FAILED)
     except WarpfemError as error:
         if not summary.frames:
             raise
-        error.add_note(_kept(summary, out))
+        error.add_note(_kept(out))
         code = _fail(error, FAILED)
     if summary.unconverged_steps:
         print(
@@ -199,8 +255,49 @@ def _run(arguments: argparse.Namespace) -> int:
     return code
 
 
-def _kept(summary: Summary, out: Path) -> str:
-    return f"{summary.frames} frame{' is' if summary.frames == 1 else 's are'} in {out}"
+def _require_consent(out: Path) -> None:
+    """Asks before what an earlier run left is replaced; refuses where nobody can be asked.
+
+    Raises:
+        OutputError: it is to stay.
+    """
+    from warpfem.usd import partial_path
+
+    partial = partial_path(out)
+    found = [f"{out} exists"] if out.exists() else []
+    if partial.exists():
+        found.append(f"{_frames_in(partial)} in {partial}, of a run that was killed")
+    if not found:
+        return
+    text = ", and ".join(found)
+    if checkpoint_path(out).exists():
+        text += f" (to go on from {checkpoint_path(out)}, use --resume)"
+    if sys.stdin.isatty() and sys.stderr.isatty():
+        print(f"{text}: overwrite? [y/N] ", end="", file=sys.stderr, flush=True)
+        if sys.stdin.readline().strip().lower() in ("y", "yes"):
+            return
+        raise OutputError("nothing was run, and nothing overwritten")
+    raise OutputError(f"{text}: use --overwrite to replace it, or another --out")
+
+
+def _frames_in(path: Path) -> str:
+    from warpfem.usd import read_animation
+
+    try:
+        count = read_animation(path).frame_count
+    except OutputError:
+        return "no readable frames are"
+    return "1 frame is" if count == 1 else f"{count} frames are"
+
+
+def _kept(out: Path) -> str:
+    """Says where the frames of a run that has ended early are."""
+    from warpfem.usd import partial_path
+
+    for path in (partial_path(out), out):
+        if path.exists():
+            return f"{_frames_in(path)} in {path}"
+    return "no frame is left"
 
 
 def _progress(frames: Iterable[Frame], total: int) -> Iterator[Frame]:
@@ -211,13 +308,16 @@ def _progress(frames: Iterable[Frame], total: int) -> Iterator[Frame]:
         except ImportError:
             pass
         else:
-            yield from tqdm(frames, total=total, unit="frame")
+            with tqdm(total=total, unit="frame") as bar:
+                for frame in frames:
+                    bar.update(frame.index + 1 - bar.n)  # a resumed run does not begin with the first
+                    yield frame
             return
     last = time.monotonic()
-    for count, frame in enumerate(frames, 1):
-        if time.monotonic() - last > 5.0 or count == total:
+    for frame in frames:
+        if time.monotonic() - last > 5.0 or frame.index + 1 == total:
             last = time.monotonic()
-            print(f"frame {count} of {total}, t = {frame.time:.3f} s", file=sys.stderr)
+            print(f"frame {frame.index + 1} of {total}, t = {frame.time:.3f} s", file=sys.stderr)
         yield frame
 
 
@@ -275,6 +375,46 @@ def _preview(arguments: argparse.Namespace) -> int:
 
     print(f"wrote {preview(arguments.file, arguments.out)}")
     return OK
+
+
+def _extremes(arguments: argparse.Namespace) -> int:
+    """Runs the cases of the stability table: extreme deformations, parameters, scales, steps and wrong input.
+
+    Every trial passes, is refused with a clear message, or FAILs; any FAIL makes the exit code 1.
+    """
+    from warpfem.extremes import CASES, report
+
+    unknown = sorted(set(arguments.case) - set(CASES))
+    if unknown:
+        raise WarpfemError(f"there is no case {unknown[0]}: the cases are {', '.join(map(str, sorted(CASES)))}")
+    out = arguments.out or (None if arguments.quick or arguments.case else STABILITY_PAGE)
+    if out:
+        _make_writable(out)
+    _start_warp()
+    say = not arguments.json
+    if say:
+        print(report.text_header(), flush=True)
+    outcomes = []
+    for number in sorted(set(arguments.case) or CASES):
+        outcomes.append(report.run_case(CASES[number], arguments.quick))
+        if say:
+            print(report.text_row(outcomes[-1]), flush=True)
+    if arguments.json:
+        print(json.dumps(report.json_data(outcomes, arguments.quick), indent=2, allow_nan=False))
+    if out:
+        out.write_text(report.markdown(outcomes, arguments.quick), encoding="utf-8")
+        if say:
+            print(f"wrote {out}")
+    return FAILED if report.failed(outcomes) else OK
+
+
+def _make_writable(out: Path) -> None:
+    """Finds out that a text file cannot be written before the work of hours is lost."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.open("a").close()
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from None
 
 
 def _info(arguments: argparse.Namespace) -> int:

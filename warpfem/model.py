@@ -168,15 +168,16 @@ class CellBlock:
             parameters,
         ]
 
-    def launch(self, name: str, inputs: list, outputs: list, *, volume: bool = True, part: slice | None = None) -> None:
+    def launch(self, name: str, inputs: list, outputs: list, *, part: slice | None = None) -> None:
         """Launches the kernel of that name over the cells, or a part of them.
 
-        ``volume`` is whether the kernel takes the cells' volumes.
+        Of :attr:`arguments` it gets first those that it names.
         """
-        arguments = self.arguments if part is None else [array[part] for array in self.arguments]
-        cells, inverse_shape, volumes, parameters = arguments
-        own = [cells, inverse_shape, volumes, parameters] if volume else [cells, inverse_shape, parameters]
-        wp.launch(getattr(self.kernels, name), len(cells), inputs=[*own, *inputs], outputs=outputs, device=self.device)
+        kernel = getattr(self.kernels, name)
+        arrays = self.arguments if part is None else [array[part] for array in self.arguments]
+        known = dict(zip(("cells", "inverse_shape", "volume", "parameters"), arrays, strict=True))
+        own = [known[argument.label] for argument in kernel.adj.args if argument.label in known]
+        wp.launch(kernel, len(arrays[0]), inputs=[*own, *inputs], outputs=outputs, device=self.device)
 
 
 class Model:
@@ -212,10 +213,10 @@ class Model:
         self.scene = scene
         self.dtype = dtype
         self.dim = scene.dim
-        self.types = types(scene.dim, dtype)
+        self.types = types(scene.dim, str(dtype))
         try:
             self.device = wp.get_device(device)
-        except (RuntimeError, ValueError) as error:
+        except (RuntimeError, ValueError, TypeError) as error:
             known = ", ".join(str(known.alias) for known in wp.get_devices())
             raise SceneError(f"no device '{device}': there is {known}") from error
         meshes = [body.mesh for body in scene.bodies]
@@ -340,7 +341,7 @@ class Model:
         psi = np.empty(self.cell_count)
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch("density", [state.u], [out], volume=False)
+            block.launch("density", [state.u], [out])
             psi[block.index] = out.numpy()
         return psi
 
@@ -405,7 +406,7 @@ class Model:
 
         vectors = _point_vectors("the direction", direction, (self.point_count, self.dim))
         p = self._device_array(vectors, self.types.vector)
-        operator = tangent_operator(self, route, clamped=False, external=False)
+        operator = tangent_operator(self, route, external=False)
         operator.linearize(state.u, mass_weight=0.0)
         out = self.zeros()
         operator.apply(p, out)
@@ -451,7 +452,7 @@ class Model:
         u = state.displacement
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=solid, device=self.device)
-            block.launch("stress", [state.u], [out], volume=False)
+            block.launch("stress", [state.u], [out])
             P[block.index] = out.numpy()
             corners = u[block.host_cells]
             edges = corners[:, 1:] - corners[:, :1]
@@ -489,7 +490,7 @@ class Model:
         for block in self.blocks:
             J = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
             stress = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch("diagnostics", [state.u], [J, stress], volume=False)
+            block.launch("diagnostics", [state.u], [J, stress])
             jacobian[block.index] = J.numpy()
             von_mises[block.index] = stress.numpy()
         return jacobian, von_mises
@@ -508,7 +509,7 @@ class Model:
 def _point_vectors(what: str, value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SimulationError(f"{what} must be numbers of shape {shape}, not {value!r}") from None
     if array.shape != shape:
         raise SimulationError(f"{what} must have shape {shape} for this model, not {array.shape}")

@@ -2,28 +2,130 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import contextlib
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from warpfem import __version__
+from warpfem.checkpoint import Checkpoint, checkpoint_path, scene_parts
 from warpfem.dtypes import FloatName
+from warpfem.errors import OutputError, SimulationError
+from warpfem.failure import failure_path, save_failure
+from warpfem.files import remove
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary, body_slices
 
+if TYPE_CHECKING:
+    from warpfem.usd import BodyFrame, UsdBody
 
-def record(simulation: Simulation, path: str | Path) -> Generator[Frame, None, None]:
+
+def record(
+    simulation: Simulation, path: str | Path, *, checkpoint_every: int | None = None, resume: bool = False
+) -> Generator[Frame, None, None]:
     """Runs a simulation and stores each frame in the USD file ``path`` before it is yielded.
 
-    If the run fails, is interrupted or the caller stops, the file holds the frames so far.
+    If the run fails, is interrupted or the caller stops, the file holds the frames so far. A file that exists is
+    overwritten, and so are the partial file, the checkpoint and the failed state that an earlier run of the same
+    ``path`` left, unless it is resumed. A run that cannot go on leaves the state in which it failed in
+    ``<stem>.failed.npz``.
+
+    Args:
+        simulation: the simulation, not yet run.
+        path: output file, ``.usdc``, ``.usd`` or ``.usda``.
+        checkpoint_every: frames between two checkpoints, which are kept in ``<stem>.checkpoint.npz`` until the
+            run has come to its end; ``None`` writes none.
+        resume: go on after the checkpoint of an earlier run of the same scene, with the frames that it left.
+            The frames after the checkpoint are computed again, and yielded.
 
     Raises:
-        OutputError: the file cannot be written; said before the first step where that can be known.
+        OutputError: the file cannot be written; there is nothing to resume, or it is of another scene. Said
+            before the first step where that can be known, and then nothing has been changed.
         SimulationError: the run cannot go on; the frames so far are in the file.
     """
-    from warpfem.usd import BodyFrame, UsdBody, UsdWriter
+    from warpfem.usd import UsdWriter
 
-    scene, model = simulation.scene, simulation.model
-    bodies = [
+    if checkpoint_every is not None and not (isinstance(checkpoint_every, int) and checkpoint_every >= 1):
+        raise OutputError(f"checkpoint_every must be a number of frames of at least 1, not {checkpoint_every!r}")
+    scene, summary = simulation.scene, simulation.summary
+    checkpoint_file, failure_file = checkpoint_path(path), failure_path(path)
+    parts = scene_parts(simulation) if checkpoint_every or resume else {}
+    start, keep = None, None
+    if resume:
+        start = Checkpoint.read(checkpoint_file)
+        start.require_fit(simulation, parts, checkpoint_file)
+        frame = simulation.restore(start.frame, start.time, start.displacement, start.velocity)
+        keep = start.frame, _body_frames(simulation, frame)
+    with UsdWriter(
+        path,
+        _usd_bodies(scene),
+        fps=scene.fps,
+        up_axis=scene.up_axis,
+        obstacles=scene.obstacles,
+        color_by=scene.color_by,
+        comment=f"warpfem {__version__}",
+        keep=keep,
+        expected_frames=scene.frames + 1,
+    ) as writer:
+        _remove(failure_file)
+        if start is None:
+            _remove(checkpoint_file)
+        else:
+            summary.take_up(start.summary)
+
+        def save_checkpoint(index: int) -> None:
+            writer.flush()
+            Checkpoint.of(simulation, index, parts).write(checkpoint_file)
+
+        with _failure_saved(simulation, failure_file):
+            for frame in simulation.frames():
+                writer.write_frame(_body_frames(simulation, frame))
+                if checkpoint_every and frame.index % checkpoint_every == 0:
+                    save_checkpoint(frame.index)
+                try:
+                    yield frame
+                except GeneratorExit:
+                    if checkpoint_every:
+                        save_checkpoint(frame.index)
+                    raise
+    _remove(checkpoint_file)
+
+
+def run(
+    scene: Scene,
+    path: str | Path,
+    *,
+    device: str | None = None,
+    dtype: FloatName = "float32",
+    checkpoint_every: int | None = None,
+    resume: bool = False,
+) -> Summary:
+    """Runs a scene and stores it in the USD file ``path``, which is overwritten if it exists.
+
+    Args:
+        scene: the scene.
+        path: output file, ``.usdc``, ``.usd`` or ``.usda``.
+        device: Warp device, for example "cpu" or "cuda:0"; ``None`` takes Warp's default.
+        dtype: "float32" or "float64".
+        checkpoint_every: frames between two checkpoints; ``None`` writes none.
+        resume: go on after the checkpoint of an earlier run, which differs in the number of frames at most.
+
+    Returns:
+        What the run did, with what came before the checkpoint.
+
+    Raises:
+        SceneError, OutputError, SimulationError: as :class:`Simulation` and :func:`record`.
+    """
+    simulation = Simulation(scene, device=device, dtype=dtype)
+    for _ in record(simulation, path, checkpoint_every=checkpoint_every, resume=resume):
+        pass
+    return simulation.summary
+
+
+def _usd_bodies(scene: Scene) -> list[UsdBody]:
+    from warpfem.usd import UsdBody
+
+    return [
         UsdBody(
             body.name,
             body.mesh.points,
@@ -32,44 +134,35 @@ def record(simulation: Simulation, path: str | Path) -> Generator[Frame, None, N
         )
         for body in scene.bodies
     ]
-    rest = model.rest_points
-    slices = body_slices(model)
-    with UsdWriter(
-        path,
-        bodies,
-        fps=scene.fps,
-        up_axis=scene.up_axis,
-        obstacles=scene.obstacles,
-        color_by=scene.color_by,
-        comment=f"warpfem {__version__}",
-    ) as writer:
-        for frame in simulation.frames():
-            x = rest + frame.displacement
-            writer.write_frame(
-                [
-                    BodyFrame(x[points], frame.velocity[points], frame.von_mises[cells], frame.jacobian[cells])
-                    for points, cells in slices
-                ]
-            )
-            yield frame
 
 
-def run(scene: Scene, path: str | Path, *, device: str | None = None, dtype: FloatName = "float32") -> Summary:
-    """Runs a scene and stores it in the USD file ``path``.
+def _body_frames(simulation: Simulation, frame: Frame) -> list[BodyFrame]:
+    from warpfem.usd import BodyFrame
 
-    Args:
-        scene: the scene.
-        path: output file, ``.usdc``, ``.usd`` or ``.usda``.
-        device: Warp device, for example "cpu" or "cuda:0"; ``None`` takes Warp's default.
-        dtype: "float32" or "float64".
+    x = simulation.model.rest_points + frame.displacement
+    return [
+        BodyFrame(x[points], frame.velocity[points], frame.von_mises[cells], frame.jacobian[cells])
+        for points, cells in body_slices(simulation.model)
+    ]
 
-    Returns:
-        What the run did.
 
-    Raises:
-        SceneError, OutputError, SimulationError: as :class:`Simulation` and :func:`record`.
-    """
-    simulation = Simulation(scene, device=device, dtype=dtype)
-    for _ in record(simulation, path):
-        pass
-    return simulation.summary
+@contextlib.contextmanager
+def _failure_saved(simulation: Simulation, path: Path) -> Iterator[None]:
+    """Saves the state in which a simulation fails."""
+    try:
+        yield
+    except SimulationError as error:
+        try:
+            save_failure(path, simulation, error)
+        except OSError as problem:
+            error.add_note(f"the state in which it failed cannot be written to {path}: {problem}")
+        else:
+            error.add_note(f"the state in which it failed is in {path}")
+        raise
+
+
+def _remove(path: Path) -> None:
+    try:
+        remove(path)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be removed: {error}") from error

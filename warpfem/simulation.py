@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -63,6 +65,7 @@ class Summary:
         largest_penetration: over all frames [m].
         newton_iterations, cg_iterations: totals over all steps.
         rounded_steps: implicit steps that rounding kept from their tolerance, with a residual below 1e-2.
+        divided_steps: implicit steps that failed as a whole and were taken in parts.
         unconverged_steps: implicit steps that stopped before their tolerance for other reasons, or above 1e-2.
         worst_residual: the largest relative residual among both.
         worst_note: how that step ended.
@@ -83,6 +86,7 @@ class Summary:
     newton_iterations: int = 0
     cg_iterations: int = 0
     rounded_steps: int = 0
+    divided_steps: int = 0
     unconverged_steps: int = 0
     worst_residual: float = 0.0
     worst_note: str = ""
@@ -97,6 +101,15 @@ class Summary:
         self.largest_von_mises = max(self.largest_von_mises, float(frame.von_mises.max()))
         self.smallest_jacobian = min(self.smallest_jacobian, float(frame.jacobian.min()))
         self.largest_penetration = max(self.largest_penetration, frame.penetration)
+
+    def totals(self) -> dict[str, Any]:
+        """What a run that is taken up again has to know, in plain numbers and texts."""
+        return {name: value for name, value in asdict(self).items() if name != "setup_seconds"}
+
+    def take_up(self, totals: Mapping[str, Any]) -> None:
+        """Goes on from the totals of an earlier run."""
+        for name, value in totals.items():
+            setattr(self, name, Energies(**value) if isinstance(value, Mapping) else value)
 
 
 class Simulation:
@@ -140,11 +153,14 @@ class Simulation:
         self.solver = solver or scene.solver
         self.stepper = self.solver.stepper(self.model)
         interval = 1.0 / scene.fps
+        self._warned: set[str] = set()  # bodies whose inverted cells have been told of
         self.steps_per_frame = max(1, math.ceil(interval / self._wanted_dt(interval) - 1e-9))
         self.dt = interval / self.steps_per_frame
         if scene.frames > 0:
             self.stepper.prepare(self.state, self.dt)
         self._observe(0)
+        self._first = 0
+        self._begun = False
         self.summary = Summary(self.dt, time.perf_counter() - start)
 
     def _wanted_dt(self, interval: float) -> float:
@@ -153,19 +169,45 @@ class Simulation:
         limit = self.stepper.stable_dt(self.state)
         return interval if limit is None else AUTO_FRACTION * limit
 
+    def restore(self, index: int, time: float, displacement: np.ndarray, velocity: np.ndarray) -> Frame:
+        """Takes the state of an earlier run at a frame: :meth:`frames` then goes on with the next one.
+
+        On the CPU the frames are the same as without the interruption, to the last bit: all that a frame's steps
+        depend on is the state at its start.
+
+        Args:
+            index: index of the frame.
+            time: its time [s], as the earlier run counted it.
+            displacement, velocity: (point_count, dim) [m] and [m/s].
+
+        Returns:
+            That frame.
+
+        Raises:
+            SimulationError: the arrays do not fit the scene.
+        """
+        self.state.assign(displacement=displacement, velocity=velocity)
+        self.state.time = time
+        self._first = index + 1
+        return self._observe(index)
+
     def frames(self) -> Iterator[Frame]:
         """Runs the scene, once; yields the initial state and then one frame per frame interval.
+
+        After :meth:`restore` the first one is that after the restored frame.
 
         Raises:
             SimulationError: the run cannot go on, or has been started before. The frames yielded so far are good.
         """
         summary = self.summary
-        if summary.frames:
+        if self._begun:
             raise SimulationError("this simulation has been run: make another one to run the scene again")
-        frame = self._observe(0)
-        summary.add_frame(frame)
-        yield frame
-        for index in range(1, self.scene.frames + 1):
+        self._begun = True
+        if self._first == 0:
+            frame = self._observe(0)
+            summary.add_frame(frame)
+            yield frame
+        for index in range(max(self._first, 1), self.scene.frames + 1):
             start = time.perf_counter()
             for _ in range(self.steps_per_frame):
                 self._step()
@@ -182,6 +224,7 @@ class Simulation:
         summary.simulated_seconds = self.state.time
         summary.newton_iterations += report.newton_iterations
         summary.cg_iterations += report.cg_iterations
+        summary.divided_steps += report.parts > 1
         if report.note:
             summary.rounded_steps += report.converged
             summary.unconverged_steps += not report.converged
@@ -203,6 +246,7 @@ class Simulation:
                 f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). A smaller dt, or a material that "
                 "bears inversion (StableNeoHookean), may help"
             )
+        self._warn_of_inverted_cells(jacobian)
         return Frame(
             index=index,
             time=state.time,
@@ -213,6 +257,21 @@ class Simulation:
             energies=model.energies(state),
             penetration=0.0 if model.contact is None else model.contact.depth(displacement),
         )
+
+    def _warn_of_inverted_cells(self, jacobian: np.ndarray) -> None:
+        """Warns, once for each body: the energies of most materials have other minima than the rest shape there."""
+        for body, (_, cells) in zip(self.scene.bodies, body_slices(self.model), strict=True):
+            inverted = np.flatnonzero(jacobian[cells] <= 0.0)
+            if len(inverted) and body.name not in self._warned and not body.material.constitutive.convex:
+                self._warned.add(body.name)
+                kind = type(body.material).__name__
+                warnings.warn(
+                    f"t = {self.state.time:.6g} s: {len(inverted)} of {body.mesh.cell_count} cells of body "
+                    f"'{body.name}' are inverted (the first is cell {inverted[0]}, J = "
+                    f"{jacobian[cells][inverted[0]]:.4g}): "
+                    + ("it may fold" if body.material.resists_mirroring else f"{kind} does not turn them back"),
+                    stacklevel=2,
+                )
 
 
 def body_slices(model: Model) -> list[tuple[slice, slice]]:

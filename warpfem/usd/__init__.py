@@ -9,6 +9,7 @@ from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_a
 from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
+from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter, check_path
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "UsdBody",
     "UsdWriter",
     "check_path",
+    "partial_path",
     "read_animation",
     "read_surface_mesh",
     "read_tet_mesh",

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pxr import Sdf, Vt
+from pxr import Sdf, Tf, Vt
 
+from warpfem.errors import OutputError
+from warpfem.files import beside, remove, replacing, settle
 from warpfem.usd.prims import WORLD, set_clock
+from warpfem.usd.saved import Chunk, partial_path
+from warpfem.usd.stages import trust
 
 Samples: TypeAlias = dict[Sdf.Path, Any]
 
@@ -27,7 +31,8 @@ class ChunkedLayer:
     The folder holds the static layer, a manifest that declares what is animated, and chunk layers with the
     samples of some frames each; the ``.usda`` joins them by value clips. Each file is written under a
     temporary name and moved into place, the ``.usda`` last, so that it opens at any moment with every frame
-    it names. Its paths are relative: file and folder can be moved together.
+    it names. Its paths are relative: file and folder can be moved together. Frames of an earlier file can be
+    kept: its chunks stay in place, and a finished file becomes a chunk.
 
     Attributes:
         path: the ``.usda``.
@@ -41,8 +46,11 @@ class ChunkedLayer:
         animated: Iterable[Sdf.Path],
         frames_per_chunk: int,
         metadata: dict[str, Any],
+        kept: Sequence[Chunk] = (),
     ) -> None:
-        """Replaces what an earlier run left under the same name, and writes a file without frames.
+        """Replaces what an earlier run left under the same name, but for the frames to keep.
+
+        Those are on disk at every moment, in the old file until they are in this one.
 
         Args:
             output: the file that :meth:`merge` will write.
@@ -50,29 +58,33 @@ class ChunkedLayer:
             animated: the attributes of ``static`` that have samples.
             frames_per_chunk: the most frames in one chunk.
             metadata: custom data of the default prim.
+            kept: the first frames, of this file's predecessor or of a finished one.
 
         Raises:
-            OSError, Tf.ErrorException: the files cannot be written.
+            OSError, Tf.ErrorException, OutputError: the files cannot be written.
         """
-        self.frame_count = 0
         self._output = output
-        self.path = output.with_name(f"{output.stem}.partial.usda")
-        self._folder = output.with_name(f"{output.stem}.partial")
+        self.path = partial_path(output)
+        self._folder = beside(output, "partial")
         self._static = static
         self._animated = tuple(animated)
         self._frames_per_chunk = frames_per_chunk
-        self._chunks: list[range] = []
         self._manifest = Sdf.Layer.CreateAnonymous(".usdc")
         for path in self._animated:
             type_name = static.GetAttributeAtPath(path).typeName
             Sdf.JustCreatePrimAttributeInLayer(self._manifest, path, type_name)
 
-        self._remove()
-        self._folder.mkdir(parents=True)
-        _export(static, self._folder / "static.usdc")
-        _export(self._manifest, self._folder / "manifest.usdc")
-        self._start_chunk()
+        if not kept or any(chunk.path.parent != self._folder for chunk in kept):
+            self._remove()
+            self._folder.mkdir(parents=True)
+        self._chunks = [self._adopt(chunk) for chunk in kept]
+        self.frame_count = sum(len(chunk.frames) for chunk in kept)
+        self._export(static, self._folder / "static.usdc")
+        self._export(self._manifest, self._folder / "manifest.usdc")
+        self._pending: list[Samples] = []
+        self._saved_at = time.monotonic()
         self._write_root(metadata)
+        self._remove_strays()
 
     def append(self, samples: Samples, metadata: dict[str, Any]) -> None:
         """Adds a frame, and saves the waiting ones if there are many or the last save was some time ago.
@@ -81,12 +93,31 @@ class ChunkedLayer:
             samples: a value for each animated attribute.
             metadata: custom data of the default prim, which stands for all frames so far.
         """
-        for path, value in samples.items():
-            self._pending.SetTimeSample(path, self.frame_count, value)
+        self._pending.append(samples)
         self.frame_count += 1
-        full = self.frame_count - self._first_pending >= self._frames_per_chunk
-        if full or time.monotonic() - self._saved_at > _PATIENCE:
-            self._save_chunk(metadata)
+        if len(self._pending) >= self._frames_per_chunk or time.monotonic() - self._saved_at > _PATIENCE:
+            self.flush(metadata)
+
+    def flush(self, metadata: dict[str, Any]) -> None:
+        """Saves the frames that wait.
+
+        Raises:
+            OSError, Tf.ErrorException, OutputError: the files cannot be written; the frames go on waiting.
+        """
+        if not self._pending:
+            return
+        frames = range(self.frame_count - len(self._pending), self.frame_count)
+        layer = Sdf.Layer.CreateAnonymous(".usdc")
+        layer.TransferContent(self._manifest)
+        for frame, samples in zip(frames, self._pending, strict=True):
+            for path, value in samples.items():
+                layer.SetTimeSample(path, frame, value)
+        chunk = Chunk(frames, self._place(frames))
+        self._export(layer, chunk.path)
+        self._write_root(metadata, chunk)
+        self._chunks.append(chunk)
+        self._pending = []
+        self._saved_at = time.monotonic()
 
     def merge(self, metadata: dict[str, Any], amend: Callable[[Samples], Samples]) -> None:
         """Writes the frames into the output file, in bounded memory, and removes the partial one.
@@ -96,91 +127,110 @@ class ChunkedLayer:
             amend: gives the samples to replace, from the samples of a frame.
 
         Raises:
-            OSError, Tf.ErrorException: the files cannot be written; the partial file stays.
+            OSError, Tf.ErrorException, OutputError: the files cannot be written; the partial file stays.
         """
-        if self._first_pending < self.frame_count:
-            self._save_chunk(metadata)
-        merged = self._folder / "merged.usdc"
+        self.flush(metadata)
+        self._require_folder()
+        merged, text = self._folder / "merged.usdc", self._folder / "merged.usda"
         try:
-            self._write_merged(merged, metadata, amend)
-            if self._output.suffix == ".usda":
-                text = merged.with_suffix(".usda")
-                Sdf.Layer.OpenAsAnonymous(str(merged)).Export(str(text))
-                os.replace(text, merged)
-            os.replace(merged, self._output)
+            with one_reason():
+                self._write_merged(merged, metadata, amend)
+                if self._output.suffix == ".usda":
+                    Sdf.Layer.OpenAsAnonymous(str(merged)).Export(str(text))
+            settle(text if text.exists() else merged, self._output)
         finally:
             merged.unlink(missing_ok=True)
+            text.unlink(missing_ok=True)
         self._remove()
 
     def _write_merged(self, path: Path, metadata: dict[str, Any], amend: Callable[[Samples], Samples]) -> None:
         merged = Sdf.Layer.CreateNew(str(path))
         merged.TransferContent(self._static)
         self._describe(merged, metadata)
-        unsaved = 0
-        for frames in self._chunks:
-            chunk_path = self._folder / _chunk_name(frames)
-            chunk = Sdf.Layer.OpenAsAnonymous(str(chunk_path))
-            for frame in frames:
-                samples = {attribute: chunk.QueryTimeSample(attribute, frame) for attribute in self._animated}
+        unsaved = 0.0
+        for chunk in self._chunks:
+            layer = chunk.open()
+            frame_bytes = chunk.path.stat().st_size / len(chunk.frames)
+            for frame in chunk.frames:
+                samples = {attribute: layer.QueryTimeSample(attribute, frame) for attribute in self._animated}
                 for attribute, value in (samples | amend(samples)).items():
                     merged.SetTimeSample(attribute, frame, value)
-            unsaved += chunk_path.stat().st_size
-            if unsaved > _MERGE_BYTES:
-                merged.Save()
-                unsaved = 0
+                unsaved += frame_bytes
+                if unsaved > _MERGE_BYTES:
+                    merged.Save()
+                    unsaved = 0.0
         merged.Save()
 
-    def _start_chunk(self) -> None:
-        self._pending = Sdf.Layer.CreateAnonymous(".usdc")
-        self._pending.TransferContent(self._manifest)
-        self._first_pending = self.frame_count
-        self._saved_at = time.monotonic()
-
-    def _save_chunk(self, metadata: dict[str, Any]) -> None:
-        frames = range(self._first_pending, self.frame_count)
-        _export(self._pending, self._folder / _chunk_name(frames))
-        self._chunks.append(frames)
-        self._start_chunk()
-        self._write_root(metadata)
-
-    def _write_root(self, metadata: dict[str, Any]) -> None:
+    def _write_root(self, metadata: dict[str, Any], *new: Chunk) -> None:
         folder = f"./{self._folder.name}"
+        chunks = [*self._chunks, *new]
         root = Sdf.Layer.CreateAnonymous(".usda")
         for key in ("defaultPrim", "metersPerUnit", "upAxis"):
             root.pseudoRoot.SetInfo(key, self._static.pseudoRoot.GetInfo(key))
         root.subLayerPaths.append(f"{folder}/static.usdc")
         self._describe(root, metadata)
-        if self._chunks:
+        if chunks:
             last = float(self.frame_count - 1)
             times = [(0.0, 0.0), (last, last)] if last > 0.0 else [(0.0, 0.0)]
-            active = [(float(frames[0]), float(index)) for index, frames in enumerate(self._chunks)]
+            active = [(float(chunk.frames[0]), float(index)) for index, chunk in enumerate(chunks)]
             clips = {
                 "primPath": WORLD.pathString,
                 "manifestAssetPath": Sdf.AssetPath(f"{folder}/manifest.usdc"),
-                "assetPaths": Sdf.AssetPathArray(
-                    [Sdf.AssetPath(f"{folder}/{_chunk_name(frames)}") for frames in self._chunks]
-                ),
+                "assetPaths": Sdf.AssetPathArray([Sdf.AssetPath(f"{folder}/{chunk.path.name}") for chunk in chunks]),
                 "active": Vt.Vec2dArray(active),
                 "times": Vt.Vec2dArray(times),
             }
             root.GetPrimAtPath(WORLD).SetInfo("clips", {"default": clips})
-        _export(root, self.path)
+        self._export(root, self.path)
+        trust(self.path, map(str, self._folder.glob("*.usdc")))
 
     def _describe(self, layer: Sdf.Layer, metadata: dict[str, Any]) -> None:
         set_clock(layer, self._static.framesPerSecond, self.frame_count)
         Sdf.CreatePrimInLayer(layer, WORLD).SetInfo("customData", metadata)
 
     def _remove(self) -> None:
-        self.path.unlink(missing_ok=True)
+        remove(self.path)
         if self._folder.exists():
             shutil.rmtree(self._folder)
 
+    def _remove_strays(self) -> None:
+        """Removes what an earlier file had more: later chunks, and what a kill left half written."""
+        kept = {"static.usdc", "manifest.usdc", *(chunk.path.name for chunk in self._chunks)}
+        for path in self._folder.iterdir():
+            if path.name not in kept and path.is_file():
+                path.unlink()
 
-def _chunk_name(frames: range) -> str:
-    return f"{frames[0]:06d}.usdc"
+    def _place(self, frames: range) -> Path:
+        return self._folder / f"{frames[0]:06d}.usdc"
+
+    def _adopt(self, chunk: Chunk) -> Chunk:
+        """The chunk in this file's folder."""
+        if chunk.path.parent == self._folder:
+            return chunk
+        own = Chunk(chunk.frames, self._place(chunk.frames))
+        if chunk.path.suffix == ".usda":
+            self._export(chunk.open(), own.path)
+        else:
+            with replacing(own.path) as temporary:
+                shutil.copyfile(chunk.path, temporary)
+        return own
+
+    def _require_folder(self) -> None:
+        if not self._folder.is_dir():
+            raise OutputError(
+                f"{self._output} cannot be written: {self._folder} has been removed, with the frames in it"
+            )
+
+    def _export(self, layer: Sdf.Layer, path: Path) -> None:
+        self._require_folder()  # exporting would make it again
+        with replacing(path) as temporary, one_reason():
+            layer.Export(str(temporary))
 
 
-def _export(layer: Sdf.Layer, path: Path) -> None:
-    temporary = path.with_name(f"writing.{path.name}")
-    layer.Export(str(temporary))
-    os.replace(temporary, path)
+@contextmanager
+def one_reason() -> Iterator[None]:
+    """Reduces what the USD library says of a failure, the same for every array, to the first reason."""
+    try:
+        yield
+    except Tf.ErrorException as problem:
+        raise OSError(problem.args[0].commentary.strip()) from problem

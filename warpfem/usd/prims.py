@@ -199,13 +199,13 @@ class BodyPrims:
                 result |= _primvar(self._tets, POINT_PRIMVARS[quantity], averages[quantity])
         return result
 
-    def surface_values(self, samples: dict[Sdf.Path, Any], quantity: ColorQuantity) -> np.ndarray:
-        """The point values on the surface, out of the samples of a frame."""
-        return np.asarray(samples[self._surface.AppendProperty(f"primvars:{POINT_PRIMVARS[quantity]}")])
+    def surface_attribute(self, quantity: ColorQuantity) -> Sdf.Path:
+        """The attribute of the point values on the surface."""
+        return self._surface.AppendProperty(f"primvars:{POINT_PRIMVARS[quantity]}")
 
     def colors(self, samples: dict[Sdf.Path, Any], scale: ColorScale) -> dict[Sdf.Path, Any]:
         """The sample of the colours that belongs to the samples of a frame."""
-        colors = scale.linear(self.surface_values(samples, scale.quantity))
+        colors = scale.linear(np.asarray(samples[self.surface_attribute(scale.quantity)]))
         return {self._surface.AppendProperty("primvars:displayColor"): Vt.Vec3fArray.FromNumpy(colors)}
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -14,14 +16,19 @@ from pxr import Gf, Sdf, Usd
 
 from warpfem.boundary import Obstacle
 from warpfem.errors import OutputError
+from warpfem.files import beside
 from warpfem.usd.bodies import BodyFrame, UsdBody, in_space
 from warpfem.usd.chunks import ChunkedLayer, Samples
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.obstacles import define_obstacles
 from warpfem.usd.prims import POINT_PRIMVARS, BodyPrims, define_world, prim_names
-from warpfem.usd.stages import reporting
+from warpfem.usd.saved import Chunk, partial_path, saved_chunks
+from warpfem.usd.stages import reporting, trust
 
 SUFFIXES = (".usdc", ".usd", ".usda")
+
+_TEXT_RATIO = 3.5
+"""Bytes of a number as text over those of a float32."""
 
 
 class UsdWriter:
@@ -31,8 +38,8 @@ class UsdWriter:
     it), which opens at any moment, also after the process was killed. A frame that comes half a second or
     more after the last save is saved at once; faster ones wait until they are ``frames_per_chunk``.
     :meth:`close` merges everything into ``path`` and removes the partial file; until then an older ``path``
-    stays as it is. **The next writer of the same ``path`` removes a partial file that a killed run left**:
-    to keep it, choose another ``path`` or move file and folder elsewhere.
+    stays as it is. **The next writer of the same ``path`` removes a partial file that a killed run left**,
+    unless it is told to keep its frames: else choose another ``path`` or move file and folder elsewhere.
 
     The file holds ``/World`` with an Xform per body. In it, ``NAME_surface`` is what viewers show; in 3D its
     sibling ``simulation`` is the tetrahedral mesh with all points. The rest shape is the default value,
@@ -57,6 +64,8 @@ class UsdWriter:
         color_range: tuple[float, float] | None = None,
         frames_per_chunk: int = 8,
         comment: str = "",
+        keep: tuple[int, Sequence[BodyFrame]] | None = None,
+        expected_frames: int = 0,
     ) -> None:
         """Checks everything that can be checked and writes a partial file that has no frames yet.
 
@@ -71,9 +80,14 @@ class UsdWriter:
                 J, with s such that at most 0.5 % of a body's surface points are beyond in any frame.
             frames_per_chunk: the most frames that wait in memory to be saved.
             comment: stored in the file as its comment.
+            keep: the last of the frames to keep that an earlier writer of the same ``path`` left, in its
+                partial file or in ``path`` itself: its index, and what it holds, to know it by. Later frames
+                are dropped. ``None`` keeps none.
+            expected_frames: the number of frames to come in all, for which there must be room on the disk.
 
         Raises:
-            OutputError: a path that cannot be written, no bodies, or settings outside their domain.
+            OutputError: a path that cannot be written, too little room, no bodies, settings outside their
+                domain, or no file that holds the frames to keep. Nothing is changed then.
         """
         self.path = Path(path)
         _check_settings(self.path, bodies, fps, up_axis, color_by, color_range, frames_per_chunk)
@@ -92,7 +106,9 @@ class UsdWriter:
             rest = self._samples([body.rest for body in self._bodies], "the rest shape")
             for attribute, value in rest.items():
                 stage.GetAttributeAtPath(attribute).Set(value)
-            self._layer = ChunkedLayer(self.path, static, rest, frames_per_chunk, self._metadata())
+            kept = [] if keep is None else self._find_kept(*keep)
+            self._check_room(rest, expected_frames)
+            self._layer = ChunkedLayer(self.path, static, rest, frames_per_chunk, self._metadata(), kept)
 
     def write_frame(self, frames: Sequence[BodyFrame]) -> None:
         """Adds the next frame.
@@ -111,8 +127,17 @@ class UsdWriter:
             raise OutputError(f"{where}: {len(frames)} bodies given, the file has {len(self._bodies)}")
         for body, frame in zip(self._bodies, frames, strict=True):
             body.check(frame, where)
-        with reporting(f"{self.path} cannot be written", OutputError):
+        with self._saving():
             self._layer.append(self._samples(frames, where), self._metadata())
+
+    def flush(self) -> None:
+        """Saves the frames that still wait in memory.
+
+        Raises:
+            OutputError: the disk takes no more.
+        """
+        with self._saving():
+            self._layer.flush(self._metadata())
 
     def close(self) -> Path:
         """Merges the frames into the output file and removes the partial one; a second call does nothing.
@@ -124,9 +149,9 @@ class UsdWriter:
             OutputError: the file cannot be written; the partial one stays.
         """
         if not self._closed:
-            saved = f"the frames are in {self._layer.path}"
-            with reporting(f"{self.path} cannot be written ({saved})", OutputError):
+            with self._saving():
                 self._layer.merge(self._metadata(), self._colors)
+            trust(self.path)
             self._closed = True
         return self.path
 
@@ -139,9 +164,52 @@ class UsdWriter:
         try:
             self.close()
         except OutputError as output_error:
-            if error is None:
+            if error is None or kind is GeneratorExit:  # which nobody gets to see
                 raise
-            error.add_note(str(output_error))
+            if str(error) != str(output_error):
+                error.add_note(str(output_error))
+
+    def _saving(self) -> contextlib.AbstractContextManager[None]:
+        saved = f"what was saved of its frames is in {self._layer.path}"
+        return reporting(f"{self.path} cannot be written ({saved})", OutputError)
+
+    def _find_kept(self, last: int, frames: Sequence[BodyFrame]) -> list[Chunk]:
+        """The chunks with the frames up to ``last``, which must be equal to ``frames``; minds their colours."""
+        expected = self._samples(frames, f"frame {last}")
+        for color in self._colors(expected):
+            del expected[color]  # their range is that of the frames so far
+        reasons = []
+        for path in (partial_path(self.path), self.path):
+            try:
+                chunks = saved_chunks(path, last + 1, expected)
+                layer = chunks[-1].open()
+                for attribute, value in expected.items():
+                    if not np.array_equal(value, layer.QueryTimeSample(attribute, last)):
+                        raise OutputError(f"{path} is of another run: its {attribute} differs in frame {last}")
+            except OutputError as error:
+                reasons.append(str(error))
+                continue
+            for chunk in chunks:
+                layer = chunk.open()
+                for frame in chunk.frames:
+                    attributes = [body.surface_attribute(self._quantity) for body in self._bodies]
+                    self._see(*(layer.QueryTimeSample(attribute, frame) for attribute in attributes))
+            return chunks
+        raise OutputError(f"{self.path}: the frames up to {last} are missing: {'; '.join(reasons)}. Run it anew")
+
+    def _check_room(self, rest: Samples, frame_count: int) -> None:
+        """The partial file and the merged one are on the disk together at the end."""
+        folder = _existing_folder(self.path)
+        frame_bytes = sum(np.asarray(value).nbytes for value in rest.values())
+        old = [path for path in beside(self.path, "partial").glob("*") if path.is_file()]
+        free = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in old)
+        copies = 2.0 + (_TEXT_RATIO if self.path.suffix == ".usda" else 0.0)
+        needed = copies * frame_count * frame_bytes
+        if needed > free:
+            raise OutputError(
+                f"{self.path} has no room: its {frame_count} frames need {_size(needed)} while they are merged at the "
+                f"end, and {folder} has {_size(free)} free: take another folder, fewer frames or a coarser mesh"
+            )
 
     @property
     def _scale(self) -> ColorScale:
@@ -158,9 +226,12 @@ class UsdWriter:
         samples: Samples = {}
         for body, frame in zip(self._bodies, frames, strict=True):
             samples |= body.samples(frame, where)
-        spreads = [spread_of(self._quantity, body.surface_values(samples, self._quantity)) for body in self._bodies]
-        self._spread = max(self._spread, *spreads)
+        self._see(*(samples[body.surface_attribute(self._quantity)] for body in self._bodies))
         return samples | self._colors(samples)
+
+    def _see(self, *surfaces: Any) -> None:
+        """Widens the range of the colours to what the bodies' surfaces show."""
+        self._spread = max(self._spread, *(spread_of(self._quantity, np.asarray(values)) for values in surfaces))
 
     def _colors(self, samples: Samples) -> Samples:
         colors: Samples = {}
@@ -173,18 +244,51 @@ def check_path(path: str | Path) -> None:
     """Checks what can be told of an output without writing anything.
 
     Raises:
-        OutputError: a name without one of ``SUFFIXES``, a folder, or a place that cannot be written to.
+        OutputError: a name without one of ``SUFFIXES``, or one that USD cannot bear; a folder, a file that is
+            write-protected, or a place that cannot be written to.
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:
-        raise OutputError(f"{path}: the name of the output must end in {', '.join(SUFFIXES)}")
-    if path.is_dir():
-        raise OutputError(f"{path} is a folder: give the name of a file")
+        raise OutputError(f"{str(path)!r}: the name of the output must end in {', '.join(SUFFIXES)}")
+    odd = _odd_part(path)
+    if odd:
+        raise OutputError(f"{str(path)!r} cannot be written: USD does not bear {odd} in the name of a file")
+    with reporting(f"{path} cannot be written", OutputError):
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            beside(path, "writing.checkpoint.npz").stat()  # as long as the longest name beside it
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder: give the name of a file")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise OutputError(f"{path} cannot be written: it is write-protected")
+        folder = _existing_folder(path)
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            raise OutputError(f"{path} cannot be written: {folder} is not a folder that can be written to")
+
+
+def _odd_part(path: Path) -> str:
+    """What USD's references to files do not bear in a path, or ""."""
+    whole = path.absolute().as_posix()
+    try:
+        whole.encode()
+    except UnicodeEncodeError:
+        return "bytes that are not UTF-8"
+    odd = [text for text in ("\0", "\\", ":SDF_FORMAT_ARGS:") if text in whole]
+    odd += [character for character in path.name if ord(character) < 32 or ord(character) == 127]
+    return repr(odd[0]) if odd else ""
+
+
+def _existing_folder(path: Path) -> Path:
+    """The folder of a path, or the one that it will be made in."""
     folder = path.absolute().parent
-    while not folder.exists():  # it will be made
+    while not folder.exists():
         folder = folder.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise OutputError(f"{path} cannot be written: {folder} is not a folder that can be written to")
+    return folder
+
+
+def _size(byte_count: float) -> str:
+    """Bytes as a person reads them."""
+    unit, name = (1e9, "GB") if byte_count >= 1e9 else (1e6, "MB")
+    return f"{byte_count / unit:.3g} {name}"
 
 
 def _check_settings(
