@@ -335,9 +335,9 @@ def _whirl(x: np.ndarray, rate: float) -> np.ndarray:
     "A slender bar of half length L = 0.5 m, nu = 0, E = 1e10 Pa, started in the stretch of the spin. Verlet: after 5 "
     "turns (quick: 1/4) the angle to 1e-3 of it, the stretch rho (w L)^2 / (3 E) to 5 %, the energy to 1 %. Backward "
     "Euler, 1000, 100, 4 and 0.25 steps a turn: the angle that its rule gives a rigid body, tan a' = sin a / (2 - cos "
-    "a) step by step, to 1 % (the bar is not quite rigid), and no gain of energy. A soft bar, E = 1e6 Pa, with "
-    "Verlet, dt = 'auto': energy to 5 %, angular momentum to 1e-4, or a refused time step. Not for linear elasticity, "
-    "whose rotated bodies grow.",
+    "a) step by step, to 1 % (the bar is not quite rigid; not asked of 0.25 steps a turn, which may be taken in "
+    "parts), the length to 1 %, and no gain of energy. A soft bar, E = 1e6 Pa, with Verlet, dt = 'auto': energy to 5 "
+    "%, angular momentum to 1e-4, or a refused time step. Not for linear elasticity, whose rotated bodies grow.",
 )
 def spin(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick, without=[LinearElasticity]):
@@ -408,13 +408,16 @@ def _implicit_spin(label: str, setting: Setting, steps_a_turn: float) -> Iterato
     except WarpfemError as error:
         yield Trial(label, "FAIL", "", str(error))
         return
-    turn, expected = np.arctan(SPIN * dt), 0.0
-    for _ in range(count):
-        expected += turn
-        turn = np.arctan2(np.sin(turn), 2.0 - np.cos(turn))
     ends = np.array([_ends(bar.mesh.points, frame) for frame in run])
-    angle = np.unwrap(np.arctan2(ends[:, 1], ends[:, 0]))
-    yield at_most(f"{label}: angle", float(abs((angle[-1] - angle[0]) / expected - 1.0)), 1e-2)
+    if steps_a_turn >= 4.0:
+        turn, expected = np.arctan(SPIN * dt), 0.0
+        for _ in range(count):
+            expected += turn
+            turn = np.arctan2(np.sin(turn), 2.0 - np.cos(turn))
+        angle = np.unwrap(np.arctan2(ends[:, 1], ends[:, 0]))
+        yield at_most(f"{label}: angle", float(abs((angle[-1] - angle[0]) / expected - 1.0)), 1e-2)
+    lengths = np.linalg.norm(ends, axis=1) / (2.0 * HALF_LENGTH)
+    yield at_most(f"{label}: length", float(np.abs(lengths - 1.0).max()), 1e-2)
     total = np.array([frame.energies.total for frame in run])
     yield at_most(f"{label}: gain of energy", float(total.max() / total[0] - 1.0), 1e-4)
 
@@ -552,7 +555,8 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
     "of a sphere of radius 1 m, and the run lasts five times the flight through its own length. No boundary point "
     "ever passes the sphere's centre or is more than the body's size inside an obstacle; at the end none is more than "
     "a tenth of the size inside; the kinetic, elastic and contact energy is never more than 1.05 times that of the "
-    "start. Or refused.",
+    "start with implicit steps, or the multiple that the scheme itself has at half its limit, 3 for symplectic Euler, "
+    "4/3 for Verlet. Or refused.",
 )
 def impact(quick: bool) -> Iterator[Trial]:
     solvers: list[tuple[Solver, float | None]] = [(NEWTON, 2e-4), (NEWTON, 1.0 / 24.0), (VERLET, None)]
@@ -589,6 +593,7 @@ def _thrown(label: str, setting: Setting, solver: Solver, dt: float | None, E: f
     figures = f"deepest {deepest:.2g} m, at the end {frame.penetration:.2g} m, energy x {max(energy) / energy[0]:.3g}"
     if far or deepest > size:
         return Trial(label, "FAIL", figures, "tunnels" if far else "goes in whole")
-    if not (frame.penetration <= 0.1 * size and max(energy) <= 1.05 * energy[0]):
+    most = natural_growth(solver, 0.5) if solver in EXPLICIT else 1.05
+    if not (frame.penetration <= 0.1 * size and max(energy) <= most * energy[0]):
         return Trial(label, "FAIL", figures)
     return Trial(label, "pass", figures)
