@@ -20,9 +20,10 @@ from pxr import Sdf
 
 import warpfem as wf
 from warpfem.checkpoint import Checkpoint, checkpoint_path
-from warpfem.cli import FAILED, OK, WRONG_USE, main
+from warpfem.cli import FAILED, OK, WRONG_USE, _parser, _recipe, main
 from warpfem.failure import failure_path
 from warpfem.files import settle
+from warpfem.scene_file import load_scene
 from warpfem.simulation import Summary
 from warpfem.usd import Animation, partial_path
 
@@ -546,6 +547,37 @@ def test_twenty_kills_at_random_moments(scene_file: Path, tmp_path: Path) -> Non
     if checkpoint_path(out).exists():
         assert main(command(scene_file, out, *options, "--resume")[3:]) == OK
     assert text(out) == text(whole)
+
+
+WAYWARD = """
+from pathlib import Path
+import warpfem as wf
+
+def scene(E: float = 1e4):
+    path = Path({count!r})
+    path.write_text(str(int(path.read_text()) + 1))
+    size = 1 + 0.01 * int(path.read_text())
+    mesh = wf.Mesh.box((size, 1, 1), (2, 2, 2)).with_point_set("base", lambda x: x[:, 1] < 0.1)
+    body = wf.Body("cube", mesh, wf.StableNeoHookean(E=E, nu=0.3), supports=[wf.Pin("base")])
+    return wf.Scene([body], wf.VelocityVerlet(), gravity=(0, -9.81, 0), fps=100, frames=4)
+"""
+
+
+def test_a_mesh_that_comes_out_different_each_time_is_that_of_the_checkpoint(tmp_path: Path, capsys) -> None:
+    """As long as the scene file and its parameters are the same; else it is another scene."""
+    scene, out, count = tmp_path / "cube.py", tmp_path / "cube.usdc", tmp_path / "count"
+    count.write_text("0")
+    scene.write_text(WAYWARD.format(count=str(count)))
+    assert main(command(scene, tmp_path / "whole.usdc")[3:]) == OK
+    count.write_text("0")
+    interrupted = wf.Simulation(load_scene(scene))
+    recipe = _recipe(_parser().parse_args(["run", str(scene)]))
+    stop(interrupted, out, 2, checkpoint_every=1, recipe=recipe)
+    assert main(command(scene, out, "--resume", "--set", "E=1e4")[3:]) == WRONG_USE
+    assert "of another run: body 'cube': the mesh" in capsys.readouterr().err
+    assert main(command(scene, out, "--resume")[3:]) == OK
+    assert int(count.read_text()) == 3  # it did come out different
+    assert text(out) == text(tmp_path / "whole.usdc")
 
 
 def test_a_command_that_cannot_resume_says_so_before_it_prepares(scene_file: Path, tmp_path: Path, capsys) -> None:
