@@ -180,7 +180,8 @@ class ChunkedLayer:
                 "times": Vt.Vec2dArray(times),
             }
             root.GetPrimAtPath(WORLD).SetInfo("clips", {"default": clips})
-        self._export(root, self.path)
+        with replacing(self.path) as temporary:  # exporting would use a temporary file of its own
+            temporary.write_text(root.ExportToString(), encoding="utf-8")
 
     def _describe(self, layer: Sdf.Layer, metadata: dict[str, Any]) -> None:
         set_clock(layer, self._static.framesPerSecond, self.frame_count)
