@@ -193,11 +193,12 @@ REFERENCES = {
 """By the name of the material in ``warpfem.materials.MATERIALS``."""
 
 
-def projected(tangent: np.ndarray) -> np.ndarray:
-    """A (d, d, d, d) tangent with its negative eigenvalues set to zero, by an eigendecomposition."""
+def filtered(tangent: np.ndarray, kind: str) -> np.ndarray:
+    """A (d, d, d, d) tangent with "absolute" or "clamped" eigenvalues, by an eigendecomposition."""
     d = len(tangent)
     values, vectors = np.linalg.eigh(tangent.reshape(d * d, d * d))
-    return ((vectors * np.maximum(values, 0.0)) @ vectors.T).reshape(d, d, d, d)
+    values = np.abs(values) if kind == "absolute" else np.maximum(values, 0.0)
+    return ((vectors * values) @ vectors.T).reshape(d, d, d, d)
 
 
 @wp.func
@@ -281,10 +282,9 @@ class Samples:
         """dP_ij/dF_kl (n, d, d, d, d) from the elements' stiffness."""
         return self._tangent("stiffness")
 
-    @cached_property
-    def clamped_tangent(self) -> np.ndarray:
-        """The same from the stiffness made positive semi-definite."""
-        return self._tangent("clamped_stiffness")
+    def filtered_tangent(self, kind: str) -> np.ndarray:
+        """The same from the stiffness made positive semi-definite, "absolute" or "clamped"."""
+        return self._tangent(f"{kind}_stiffness")
 
     def _tangent(self, kernel: str) -> np.ndarray:
         (block,) = self.model.blocks

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "warpfem"
 
 LAYERS = [
     {"errors"},
-    {"files", "tensor", "dtypes", "boundary", "moduli", "profiling"},
+    {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child"},
     {"mesh", "points"},
     {"materials"},
     {"elements", "meshing"},
@@ -21,6 +21,7 @@ LAYERS = [
     {"simulation"},
     {"usd", "checkpoint", "failure"},
     {"record", "explain", "scene_file", "preview"},
+    {"extremes"},
     {"cli"},
     {"__main__"},
 ]

@@ -50,6 +50,27 @@ def test_auto_dt_is_half_the_limit_for_explicit_steps_and_the_interval_for_impli
     assert wf.Simulation(cube(frames=1)).dt == pytest.approx(1 / 24)
 
 
+@pytest.mark.parametrize(
+    ("material", "message"),
+    [(wf.StVenantKirchhoff, "StVenantKirchhoff does not turn them back"), (wf.StableNeoHookean, "it may fold")],
+)
+def test_inverted_cells_are_warned_of_once(material, message):
+    mirrored = cube(frames=1, material=material(1e5, 0.3), displacement=lambda x: -2.0 * x * (1.0, 0.0, 0.0))
+    with pytest.warns(UserWarning, match="inverted") as warned:
+        for _ in wf.Simulation(mirrored, device="cpu").frames():
+            pass
+    (text,) = (str(warning.message) for warning in warned)
+    assert text.startswith("t = 0 s: 5 of 5 cells of body 'cube' are inverted (the first is cell 0, J = -1)")
+    assert message in text
+
+
+def test_no_warning_without_inverted_cells_or_where_they_do_no_harm(recwarn):
+    wf.Simulation(cube(frames=0, displacement=lambda x: -0.9 * x), device="cpu")
+    linear = wf.LinearElasticity(1e5, 0.3)
+    wf.Simulation(cube(frames=0, material=linear, displacement=lambda x: -2.0 * x * (1.0, 0.0, 0.0)), device="cpu")
+    assert not recwarn.list
+
+
 def test_the_step_thrown_away_leaves_no_trace():
     scene = cube(gravity=(0, -10, 0), dt=1 / 24, frames=1)
     simulation = wf.Simulation(scene)
@@ -116,7 +137,7 @@ def test_summary_counts_unconverged_steps():
     hard = cube(
         supports=[wf.Pin("bottom")],
         loads=[wf.Traction("top", (0, -2e5, 0))],
-        solver=wf.BackwardEuler(max_iterations=2, tolerance=1e-9),
+        solver=wf.BackwardEuler(max_iterations=2, tolerance=1e-9, unconverged="accept"),
         frames=2,
     )
     simulation = wf.Simulation(hard, dtype="float64")

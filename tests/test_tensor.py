@@ -178,6 +178,15 @@ def test_rotation_differential(dim, dtype, scale):
     assert (np.linalg.norm(dR - expected, axis=(1, 2)) <= tolerance * bound).all()
 
 
+def test_rotation_differential_of_a_needle():
+    """Stretches of 1e3, 1e-3 and 1e-3 in float64: the two small ones hide in the rounding of float32 alone."""
+    t = types(3, "float64")
+    F = np.diag([1e3, 1e-3, 1e-3])[None]
+    G = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])  # turns the two by 2 / (1e-3 + 1e-3)
+    (dR,) = launch(kernels(3, "float64").rotation_differential, (F, t.matrix), (G, t.matrix), outputs=[t.matrix])
+    np.testing.assert_allclose(dR, 1e3 * G, rtol=1e-8, atol=1e-8)
+
+
 @settings
 def test_rotation_differential_stays_bounded(dim, dtype):
     """Where R is not unique its rate is cut off, neither infinite nor NaN."""

@@ -6,6 +6,7 @@ that have such a term; constant loads become one force per point in ``model.py``
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -20,10 +21,20 @@ PointSelection: TypeAlias = str | Sequence[int] | np.ndarray
 Vector: TypeAlias = Sequence[float]
 
 
+def is_number(value: object) -> bool:
+    """Whether it is one finite number that float64 can hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return False
+    try:
+        return math.isfinite(value)
+    except (OverflowError, TypeError):  # an integer of 400 digits, a complex number
+        return False
+
+
 def _vector(owner: str, name: str, value: Vector) -> tuple[float, ...]:
     try:
         vector = tuple(float(component) for component in value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f"{owner}: {name} must be a vector of numbers, not {value!r}") from None
     if len(vector) not in (2, 3) or not np.isfinite(vector).all():
         raise SceneError(f"{owner}: {name} must be a finite vector of length 2 or 3, not {value!r}")
@@ -31,8 +42,7 @@ def _vector(owner: str, name: str, value: Vector) -> tuple[float, ...]:
 
 
 def _number(owner: str, name: str, value: float, *, above: float | None = None, least: float | None = None):
-    ok = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and np.isfinite(value)
-    if not ok or (above is not None and value <= above) or (least is not None and value < least):
+    if not is_number(value) or (above is not None and value <= above) or (least is not None and value < least):
         domain = f" above {above:g}" if above is not None else f" of at least {least:g}" if least is not None else ""
         raise SceneError(f"{owner}: {name} must be a finite number{domain}, not {value!r}")
 

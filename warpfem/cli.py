@@ -24,6 +24,8 @@ from warpfem.simulation import Frame, Simulation, Summary
 
 OK, FAILED, WRONG_USE = 0, 1, 2
 
+STABILITY_PAGE = Path("docs") / "stability.md"
+
 EXTRAS = {
     "meshio": "mesh",
     "pytetwild": "tet",
@@ -93,6 +95,22 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--out", type=Path, required=True, metavar="F", help=".png (a sheet of frames) or .gif (the motion)"
     )
     preview.set_defaults(command=_preview)
+
+    extremes = commands.add_parser(
+        "extremes", help="measure the stability of warpfem at the extremes", description=_extremes.__doc__
+    )
+    extremes.add_argument("--quick", action="store_true", help="few settings and small meshes, about two minutes")
+    extremes.add_argument("--json", action="store_true", help="print the results as JSON, and nothing else")
+    extremes.add_argument(
+        "--case", type=int, nargs="+", default=[], metavar="N", help="only the cases of these numbers"
+    )
+    extremes.add_argument(
+        "--out",
+        type=Path,
+        metavar="F",
+        help=f"Markdown file of all figures (default: {STABILITY_PAGE}, if neither --quick nor --case is given)",
+    )
+    extremes.set_defaults(command=_extremes)
 
     info = commands.add_parser("info", help="print versions and devices", description=_info.__doc__)
     info.set_defaults(command=_info)
@@ -369,6 +387,46 @@ def _preview(arguments: argparse.Namespace) -> int:
 
     print(f"wrote {preview(arguments.file, arguments.out)}")
     return OK
+
+
+def _extremes(arguments: argparse.Namespace) -> int:
+    """Runs the cases of the stability table: extreme deformations, parameters, scales, steps and wrong input.
+
+    Every trial passes, is refused with a clear message, or FAILs; any FAIL makes the exit code 1.
+    """
+    from warpfem.extremes import CASES, report
+
+    unknown = sorted(set(arguments.case) - set(CASES))
+    if unknown:
+        raise WarpfemError(f"there is no case {unknown[0]}: the cases are {', '.join(map(str, sorted(CASES)))}")
+    out = arguments.out or (None if arguments.quick or arguments.case else STABILITY_PAGE)
+    if out:
+        _make_writable(out)
+    _start_warp()
+    say = not arguments.json
+    if say:
+        print(report.text_header(), flush=True)
+    outcomes = []
+    for number in sorted(set(arguments.case) or CASES):
+        outcomes.append(report.run_case(CASES[number], arguments.quick))
+        if say:
+            print(report.text_row(outcomes[-1]), flush=True)
+    if arguments.json:
+        print(json.dumps(report.json_data(outcomes, arguments.quick), indent=2, allow_nan=False))
+    if out:
+        out.write_text(report.markdown(outcomes, arguments.quick), encoding="utf-8")
+        if say:
+            print(f"wrote {out}")
+    return FAILED if report.failed(outcomes) else OK
+
+
+def _make_writable(out: Path) -> None:
+    """Finds out that a text file cannot be written before the work of hours is lost."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.open("a").close()
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from None
 
 
 def _info(arguments: argparse.Namespace) -> int:

@@ -7,13 +7,14 @@ module of its own, only once something asks for them.
 """
 
 import functools
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import warp as wp
 
 from warpfem.dtypes import types
 from warpfem.materials.base import Constitutive
 from warpfem.tensor import (
+    cofactor,
     deformation_gradient,
     embed,
     identity_like,
@@ -22,23 +23,21 @@ from warpfem.tensor import (
     volume_change,
 )
 
-
-@wp.func
-def _clamped(A: Any):
-    for i in range(len(A)):
-        A[i, i] = wp.max(A[i, i], A.dtype(0.0))
-    return A
+Filter: TypeAlias = Literal["absolute", "clamped"]
+"""What becomes of the negative eigenvalues of a cell's d²psi/dF²: their absolute values, or zero."""
 
 
 @wp.func
-def _positive_part(A: Any):
-    """The symmetric matrix A with its negative eigenvalues set to zero."""
-    if is_positive_definite(A):
-        return A
-    shift = wp.sqrt(wp.ddot(A, A))
-    V, _s, _V = signed_svd(A + shift * identity_like(A))  # positive semi-definite: V holds eigenvectors
-    D = wp.transpose(V) * A * V
-    return V * wp.cw_mul(identity_like(A), _clamped(D)) * wp.transpose(V)
+def _absolute(eigenvalue: Any):
+    return wp.abs(eigenvalue)
+
+
+@wp.func
+def _clamped(eigenvalue: Any):
+    return wp.max(eigenvalue, type(eigenvalue)(0.0))
+
+
+_FILTERS = {"absolute": _absolute, "clamped": _clamped}
 
 
 class ElementKernels:
@@ -167,7 +166,12 @@ class ElementKernels:
     @functools.cached_property
     def clamped_differential(self) -> wp.Kernel:
         """:attr:`differential` with each element's K made positive semi-definite (isotropic materials)."""
-        return self._differential_kernel(self._clamped_rule()) if self._clampable else self.differential
+        return self._differential_kernel(self._filtered_rule("clamped")) if self._filterable else self.differential
+
+    @functools.cached_property
+    def absolute_differential(self) -> wp.Kernel:
+        """:attr:`differential` with the absolute values of each element's eigenvalues (isotropic materials)."""
+        return self._differential_kernel(self._filtered_rule("absolute")) if self._filterable else self.differential
 
     def _differential_kernel(self, rule: tuple) -> wp.Kernel:
         dim = self.dim
@@ -212,7 +216,12 @@ class ElementKernels:
     @functools.cached_property
     def clamped_stiffness(self) -> wp.Kernel:
         """:attr:`stiffness` with each element's K made positive semi-definite (isotropic materials)."""
-        return self._clamped_stiffness_kernel() if self._clampable else self.stiffness
+        return self._filtered_stiffness_kernel("clamped") if self._filterable else self.stiffness
+
+    @functools.cached_property
+    def absolute_stiffness(self) -> wp.Kernel:
+        """:attr:`stiffness` with the absolute values of each element's eigenvalues (isotropic materials)."""
+        return self._filtered_stiffness_kernel("absolute") if self._filterable else self.stiffness
 
     def _exact_stiffness_kernel(self) -> wp.Kernel:
         dim = self.dim
@@ -253,17 +262,17 @@ class ElementKernels:
 
         return element_stiffness
 
-    def _clamped_stiffness_kernel(self) -> wp.Kernel:
+    def _filtered_stiffness_kernel(self, kind: Filter) -> wp.Kernel:
         dim = self.dim
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         add_block = self._add_block
         displacement_gradient = self._displacement_gradient
-        tangent, _apply = self._clamped_rule()
+        tangent, _apply = self._filtered_rule(kind)
         gradients_type = wp.types.matrix(shape=(dim + 1, dim), dtype=scalar)
 
         @wp.kernel(module="unique", enable_backward=False)
-        def clamped_element_stiffness(
+        def filtered_element_stiffness(
             cells: wp.array(dtype=cell_type),
             inverse_shape: wp.array(dtype=matrix),
             volume: wp.array(dtype=scalar),
@@ -293,7 +302,73 @@ class ElementKernels:
                     if b > a:
                         add_block(blocks_out, slots[i, b, a], wp.transpose(block))
 
-        return clamped_element_stiffness
+        return filtered_element_stiffness
+
+    @functools.cached_property
+    def step_limit(self) -> wp.Kernel:
+        """Lowers ``limit_out[0]`` to the least s > 0 at which u + s p takes a cell to J = 0.
+
+        J is a polynomial in s. With its negative coefficients alone it is a bound from below that falls
+        steadily, so that its root is never beyond the first one of J; from there the next bound starts.
+        """
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        displacement_gradient = self._displacement_gradient
+
+        @wp.func
+        def cubic_part(dH: matrix):
+            if wp.static(dim == 3):
+                return wp.determinant(dH)
+            return scalar(0.0)
+
+        @wp.func
+        def quadratic_part(F: matrix, dH: matrix):
+            if wp.static(dim == 3):
+                return wp.ddot(F, cofactor(dH))
+            return wp.determinant(dH)
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_step_limit(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            u: wp.array(dtype=vector),
+            p: wp.array(dtype=vector),
+            limit_out: wp.array(dtype=scalar),
+        ):
+            i = wp.tid()
+            zero = scalar(0.0)
+            cell = cells[i]
+            H = displacement_gradient(u, cell, inverse_shape[i])
+            dH = displacement_gradient(p, cell, inverse_shape[i])
+            c3 = wp.min(cubic_part(dH), zero)
+            s = zero
+            searching = bool(True)
+            rounds = int(20)
+            for _round in range(rounds):
+                if searching:
+                    now = H + s * dH
+                    J = scalar(1.0) + volume_change(now)
+                    F = deformation_gradient(now)
+                    c1 = wp.min(wp.ddot(cofactor(F), dH), zero)
+                    c2 = wp.min(quadratic_part(F, dH), zero)
+                    rest = limit_out[0] - s
+                    bound = J + rest * (c1 + rest * (c2 + rest * c3))
+                    if J > zero and bound > zero:
+                        s = limit_out[0]
+                    if J <= zero or bound > zero:
+                        searching = bool(False)
+                    else:
+                        step = rest  # Newton's method from the right: the bound is concave
+                        for _iteration in range(rounds):
+                            value = J + step * (c1 + step * (c2 + step * c3))
+                            slope = c1 + step * (scalar(2.0) * c2 + step * scalar(3.0) * c3)
+                            step = step - value / slope
+                        s += scalar(0.999) * step
+                        if step <= scalar(1.0e-3) * s:
+                            searching = bool(False)
+            wp.atomic_min(limit_out, 0, s)
+
+        return element_step_limit
 
     @functools.cached_property
     def stress(self) -> wp.Kernel:
@@ -354,7 +429,7 @@ class ElementKernels:
 
         @wp.func
         def plane_strain_stress(H: Any, parameters: Any):
-            _late = wp.grad(wp.neg)(H[0, 0])  # as in _clamped_rule, for a stress that calls wp.grad
+            _late = wp.grad(wp.neg)(H[0, 0])  # as in _filtered_rule, for a stress that calls wp.grad
             P = stress(embed(H), parameters)
             plane = stress(H, parameters)
             for i in range(2):
@@ -365,7 +440,7 @@ class ElementKernels:
         return plane_strain_stress
 
     @property
-    def _clampable(self) -> bool:
+    def _filterable(self) -> bool:
         return self.constitutive.isotropic and not self.constitutive.convex
 
     @property
@@ -382,8 +457,8 @@ class ElementKernels:
 
         return tangent, self.constitutive.stress_differential
 
-    def _clamped_rule(self) -> tuple:
-        """d²psi/dF² of an isotropic material with its negative eigenvalues set to zero.
+    def _filtered_rule(self, kind: Filter) -> tuple:
+        """d²psi/dF² of an isotropic material with its negative eigenvalues made positive or zero.
 
         In the principal axes, F = U diag(s) V^T, the fourth-order tensor falls into one d x d block that
         couples the stretches, and for each pair (i, j) the 2x2 block [[a, b], [b, a]] of the entries ij and
@@ -391,8 +466,22 @@ class ElementKernels:
         from the material's own differential at diag(s), so that no material has to state its eigenvalues.
         """
         dim = self.dim
-        matrix, scalar = self.types.matrix, self.types.scalar
+        vector, matrix, scalar = self.types.vector, self.types.matrix, self.types.scalar
         stress_differential = self.constitutive.stress_differential
+        corotated = self.constitutive.corotated
+        filtered = _FILTERS[kind]
+
+        @wp.func
+        def filtered_block(A: matrix):
+            if is_positive_definite(A):
+                return A
+            shift = wp.sqrt(wp.ddot(A, A))
+            axes, _s, _axes = signed_svd(A + shift * identity_like(A))  # positive semi-definite: eigenvectors
+            D = wp.transpose(axes) * A * axes
+            eigenvalues = vector()
+            for k in range(dim):
+                eigenvalues[k] = filtered(D[k, k])
+            return axes * wp.diag(eigenvalues) * wp.transpose(axes)
 
         @wp.struct
         class Tangent:
@@ -421,8 +510,11 @@ class ElementKernels:
                         for k in range(count):
                             stretch[k, i] = dP[k, k]
                     else:
-                        flip = wp.max(dP[i, j] + dP[j, i], scalar(0.0))
-                        twist = wp.max(dP[i, j] - dP[j, i], scalar(0.0))
+                        flip = filtered(dP[i, j] + dP[j, i])
+                        twist = dP[i, j] - dP[j, i]
+                        if wp.static(corotated) and s[i] + s[j] < scalar(1.0):
+                            twist = wp.max(twist, scalar(0.0))  # it has no bound where s_i + s_j nears 0
+                        twist = filtered(twist)
                         same[i, j] = scalar(0.5) * (flip + twist)
                         same[j, i] = same[i, j]
                         swapped[i, j] = scalar(0.5) * (flip - twist)
@@ -430,7 +522,7 @@ class ElementKernels:
             result = Tangent()
             result.U = U
             result.V = V
-            result.stretch = _positive_part(scalar(0.5) * (stretch + wp.transpose(stretch)))
+            result.stretch = filtered_block(scalar(0.5) * (stretch + wp.transpose(stretch)))
             result.same = same
             result.swapped = swapped
             return result

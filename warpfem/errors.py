@@ -1,6 +1,7 @@
 """The exceptions of warpfem. Each message says what is wrong, where, and what to try."""
 
 import os
+import textwrap
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,14 +52,30 @@ def user_code(where: str, file: str) -> Iterator[None]:
     """
     try:
         yield
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit, and what else a user's code may raise
         reached = [f for f in traceback.extract_tb(error.__traceback__) if _same_file(f.filename, file)]
         line = f"{file}, line {reached[-1].lineno}" if reached else file
         if isinstance(error, WarpfemError):
             if reached:
                 error.add_note(f"in {line}")
             raise
-        raise SceneError(f"{where}: {type(error).__name__}: {error} ({line})") from error
+        raise SceneError(f"{where}: {described(error)} ({line})") from error
+
+
+def described(error: BaseException) -> str:
+    """What kind of error it is and what it says, on one line."""
+    try:
+        text = str(error)
+    except Exception:  # the text is a user's code, too
+        text = "without a text"
+    return one_line(f"{type(error).__name__}: {text}" if text else type(error).__name__)
+
+
+def one_line(text: str) -> str:
+    """What others say, on one line that is not too long."""
+    return textwrap.shorten(text, 300, placeholder=" ...")
 
 
 def source_of(function: object) -> str:

@@ -10,15 +10,19 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum
 from types import SimpleNamespace
+from typing import Literal, TypeAlias
 
 import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
+from warpfem.elements import Filter
 from warpfem.errors import SimulationError
 from warpfem.model import CellBlock, Model, Route
 from warpfem.points import CHUNK, chunks
 from warpfem.tensor import is_positive_definite
+
+Hessian: TypeAlias = Literal["exact", Filter]
 
 # Entries of the float64 array of scalars that conjugate gradients keep on the device.
 _RHO = wp.constant(0)  # r . z
@@ -218,10 +222,10 @@ class TangentOperator(ABC):
             after ``linearize(..., precondition=True)``.
     """
 
-    def __init__(self, model: Model, clamped: bool, external: bool) -> None:
+    def __init__(self, model: Model, external: bool) -> None:
         self.model = model
         self.kernels = operator_kernels(model.dim, model.dtype)
-        self.clamped = clamped
+        self.hessian: Hessian = "exact"
         self.supports = model.supports if external else None
         self.contact = model.contact if external else None
         self.inverse_diagonal: wp.array | None = None
@@ -234,6 +238,7 @@ class TangentOperator(ABC):
         u: wp.array,
         mass_weight: float,
         *,
+        hessian: Hessian = "exact",
         friction: tuple[wp.array, float] | None = None,
         precondition: bool = False,
     ) -> None:
@@ -242,6 +247,8 @@ class TangentOperator(ABC):
         Args:
             u: displacements, device array.
             mass_weight: w [1/s^2].
+            hessian: what becomes of the negative eigenvalues of each cell's stiffness: "exact" leaves them,
+                "absolute" takes their absolute values, "clamped" zero.
             friction: start of the step and dt, if friction of a step is to be included.
             precondition: whether to compute :attr:`inverse_diagonal`.
         """
@@ -253,6 +260,9 @@ class TangentOperator(ABC):
     @abstractmethod
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
+
+    def _kernel(self, name: str) -> str:
+        return name if self.hessian == "exact" else f"{self.hessian}_{name}"
 
     def _new_blocks(self, count: int) -> wp.array:
         return wp.zeros(count, dtype=self.model.types.matrix, device=self.model.device)
@@ -275,7 +285,7 @@ class TangentOperator(ABC):
         """Elements, mass and contact into ``blocks``, whose diagonal is at ``self.diagonal``."""
         blocks.zero_()
         for block, own in zip(self.model.blocks, slots, strict=True):
-            block.launch("clamped_stiffness" if self.clamped else "stiffness", [u, own], [blocks])
+            block.launch(self._kernel("stiffness"), [u, own], [blocks])
         if mass_weight > 0.0:
             self._launch(self.kernels.add_mass, [self.model.mass, mass_weight, self.diagonal], [blocks])
         if self.contact_blocks is not None:
@@ -290,8 +300,8 @@ class TangentOperator(ABC):
 class AssembledOperator(TangentOperator):
     """A stored as d x d blocks in compressed rows."""
 
-    def __init__(self, model: Model, clamped: bool, external: bool) -> None:
-        super().__init__(model, clamped, external)
+    def __init__(self, model: Model, external: bool) -> None:
+        super().__init__(model, external)
         row_starts, columns, slots = _block_pattern(model)
         diagonal = np.flatnonzero(columns == np.repeat(np.arange(model.point_count), np.diff(row_starts)))
         self.row_starts = self._indices(row_starts)
@@ -300,7 +310,8 @@ class AssembledOperator(TangentOperator):
         self.slots = [self._indices(own) for own in slots]
         self.blocks = self._new_blocks(len(columns))
 
-    def linearize(self, u, mass_weight, *, friction=None, precondition=False) -> None:
+    def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
+        self.hessian = hessian
         self._update_contact(u, friction)
         self._assemble(u, self.slots, mass_weight, self.blocks)
         if self.supports is not None:
@@ -332,8 +343,8 @@ class AssembledOperator(TangentOperator):
 class _UnassembledOperator(TangentOperator):
     """A whose product with K is computed from the elements each time."""
 
-    def __init__(self, model: Model, clamped: bool, external: bool) -> None:
-        super().__init__(model, clamped, external)
+    def __init__(self, model: Model, external: bool) -> None:
+        super().__init__(model, external)
         self.u: wp.array | None = None
         self.mass_weight = 0.0
 
@@ -352,8 +363,9 @@ class _UnassembledOperator(TangentOperator):
         self.diagonal = self._indices(np.arange(n))
         return self._new_blocks(n), slots, self._indices(np.arange(n + 1))
 
-    def linearize(self, u, mass_weight, *, friction=None, precondition=False) -> None:
+    def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
         self.u = u
+        self.hessian = hessian
         self.mass_weight = mass_weight
         self._update_contact(u, friction)
         if precondition:
@@ -392,7 +404,7 @@ class ClosedFormOperator(_UnassembledOperator):
     """A with K p from each material's stress differential in closed form."""
 
     def _add_stiffness_product(self, p, product_out) -> None:
-        name = "clamped_differential" if self.clamped else "differential"
+        name = self._kernel("differential")
         for block in self.model.blocks:
             block.launch(name, [self.u, p], [product_out])
 
@@ -403,16 +415,16 @@ class TapeOperator(_UnassembledOperator):
     A material whose stress Warp cannot differentiate puts its own differential on the tape.
     """
 
-    def __init__(self, model: Model, clamped: bool, external: bool) -> None:
-        if clamped:
-            raise ValueError("a tape differentiates the force as it is: use clamped=False")
-        super().__init__(model, clamped, external)
+    def __init__(self, model: Model, external: bool) -> None:
+        super().__init__(model, external)
         types_, device = model.types, model.device
         self._u = wp.zeros(model.point_count, dtype=types_.vector, device=device, requires_grad=True)
         self._force = wp.zeros(model.point_count, dtype=types_.vector, device=device, requires_grad=True)
         self._tape: wp.Tape | None = None
 
-    def linearize(self, u, mass_weight, *, friction=None, precondition=False) -> None:
+    def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
+        if hessian != "exact":
+            raise ValueError("a tape differentiates the force as it is: take hessian='exact'")
         super().linearize(u, mass_weight, friction=friction, precondition=precondition)
         wp.copy(self._u, u)
         if self._tape is None:
@@ -438,19 +450,18 @@ class TapeOperator(_UnassembledOperator):
         return [*super().arrays(), self._u, self._u.grad, self._force, self._force.grad]
 
 
-def tangent_operator(model: Model, route: Route, *, clamped: bool = False, external: bool = True) -> TangentOperator:
+def tangent_operator(model: Model, route: Route, *, external: bool = True) -> TangentOperator:
     """The operator for a route.
 
     Args:
         model: the model.
         route: "assembled", "closed" or "tape".
-        clamped: whether each element's stiffness is made positive semi-definite.
         external: whether contact and supports are part of it.
     """
     operators = {"assembled": AssembledOperator, "closed": ClosedFormOperator, "tape": TapeOperator}
-    if route not in operators:
+    if not isinstance(route, str) or route not in operators:
         raise SimulationError(f"route must be one of {', '.join(map(repr, operators))}, not {route!r}")
-    return operators[route](model, clamped, external)
+    return operators[route](model, external)
 
 
 def _block_pattern(model: Model) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:

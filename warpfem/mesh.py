@@ -17,7 +17,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from warpfem.errors import MeshError
+from warpfem.boundary import is_number
+from warpfem.errors import MeshError, source_of, user_code
 
 Selection: TypeAlias = str | int | Sequence[int] | np.ndarray
 """The name of a set, or indices."""
@@ -184,7 +185,7 @@ class Mesh:
             MeshError: a size or count is not positive, not three of them are given, or the split is
                 neither 5 nor 6.
         """
-        if split not in (5, 6):
+        if not isinstance(split, int) or split not in (5, 6):
             raise MeshError(f"split must be 5 or 6 tetrahedra per cube, not {split!r}")
         if split == 6:
             return cls._grid(size, cells, origin, _CUBE_6, _CUBE_6)
@@ -232,7 +233,7 @@ class Mesh:
         Raises:
             MeshError: the scale is not positive and finite, or the offset is not a finite vector.
         """
-        if not (isinstance(scale, (int, float, np.number)) and 0.0 < scale < np.inf):
+        if not is_number(scale) or scale <= 0.0:
             raise MeshError(f"scale must be a positive number, not {scale!r}")
         shift = 0.0 if offset is None else _vector("offset", offset, self.dim)
         return replace(self, points=scale * self.points + shift)
@@ -580,10 +581,16 @@ def _indices(kind: str, owner: str, value: object, count: int) -> np.ndarray:
     return array.astype(np.int32)
 
 
+def _check_name(kind: str, name: object) -> None:
+    if not isinstance(name, str) or not name:
+        raise MeshError(f"the name of a {kind} set must be a non-empty str, not {name!r}")
+
+
 def _sets(kind: str, sets: Mapping[str, Any], count: int) -> Mapping[str, np.ndarray]:
+    if not isinstance(sets, Mapping):
+        raise MeshError(f"{kind}_sets must be a dict from names to {kind} indices, not {sets!r}")
     for name in sets:
-        if not isinstance(name, str) or not name:
-            raise MeshError(f"the name of a {kind} set must be a non-empty str, not {name!r}")
+        _check_name(kind, name)
     return MappingProxyType(
         {name: _frozen(_indices(kind, f"{kind} set {name!r}", value, count)) for name, value in sets.items()}
     )
@@ -610,9 +617,11 @@ def _selected(kind: str, selection: Selection, sets: Mapping[str, np.ndarray], c
 
 
 def _defined(kind: str, name: str, selection: Definition, positions: np.ndarray) -> np.ndarray:
+    _check_name(kind, name)
     owner = f"{kind} set {name!r}"
     if callable(selection):
-        mask = np.asarray(selection(positions))
+        with user_code(owner, source_of(selection)):
+            mask = np.asarray(selection(positions))
         if mask.dtype != bool or mask.shape != (len(positions),):
             raise MeshError(
                 f"{owner}: the function must return a boolean mask of shape ({len(positions)},), one value "

@@ -1,11 +1,14 @@
 """Meshes from elsewhere: mesh files, surface files, and tetrahedra inside a closed surface.
 
+Files are read in a child process: what is wrong with one cannot harm this one.
+
 What this needs beyond NumPy is optional and imported where it is used: ``meshio`` (extra ``mesh``) reads
 mesh files, ``pytetwild`` (extra ``tet``) fills surfaces.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import os
 import re
@@ -19,7 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from warpfem.errors import MeshError, MissingExtraError
+from warpfem.boundary import is_number
+from warpfem.child import DAMAGED, existing, read_in_child
+from warpfem.errors import MeshError, MissingExtraError, described, one_line
 from warpfem.mesh import Mesh, _array, _check_references
 
 _USD = {".usd", ".usda", ".usdc", ".usdz"}
@@ -32,6 +37,7 @@ _MARKS = {
     ".mdpa": rb"^\s*End \w+\s*\Z",
     ".ply": rb"^end_header\s",
     ".off": rb"^\s*\d+\s+\d+\s+\d+\s",
+    ".stl": rb"\A(?!solid)|^\s*endsolid",  # text starts with the word
 }
 
 MAX_CLOSED_AREA_RATIO = 1.1
@@ -57,15 +63,17 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
             mesh cannot be simulated; triangles off the plane are a surface, for :func:`tetrahedralize`.
         MissingExtraError: meshio is not installed.
     """
-    path = _existing(path)
+    path = existing(path, MeshError)
     if path.suffix.lower() in _USD:
         from warpfem.usd import read_tet_mesh
 
         points, cells = read_tet_mesh(path)
         with _naming(path):
             return Mesh.repaired(points, cells)
+    _require_meshio(path)
+    arrays = read_in_child(read_solid_file, path, MeshError)
     with _naming(path):
-        return _solid(_read_file(path))
+        return Mesh.repaired(*arrays)
 
 
 def read_surface(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -82,18 +90,16 @@ def read_surface(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         MeshError: the file is missing, damaged or of an unknown format, or has no faces.
         MissingExtraError: meshio is not installed.
     """
-    path = _existing(path)
+    path = existing(path, MeshError)
     if path.suffix.lower() in _USD:
         from warpfem.usd import read_surface_mesh
 
-        return read_surface_mesh(path)
+        arrays = read_surface_mesh(path)
+    else:
+        _require_meshio(path)
+        arrays = read_in_child(read_surface_file, path, MeshError)
     with _naming(path):
-        file = _read_file(path)
-        faces = [block.data for block in file.cells if block.type in ("triangle", "quad", "polygon")]
-        fans = [face[:, [0, k, k + 1]] for face in faces for k in range(1, face.shape[1] - 1)]
-        if not fans:
-            raise MeshError("the file holds no triangles, quadrilaterals or polygons")
-        return _surface(file.points[:, :3], np.concatenate(fans))
+        return _surface(*arrays)
 
 
 def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float | None = None) -> Mesh:
@@ -129,7 +135,7 @@ def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float
         raise MeshError("the surface is flat and encloses no volume: give the closed surface of a solid")
     if edge_length is None:
         edge_length = diagonal / 20.0
-    if not 0.0 < edge_length <= diagonal:
+    if not is_number(edge_length) or not 0.0 < edge_length <= diagonal:
         raise MeshError(
             f"edge_length must be above 0 and at most the diagonal of the surface's bounding box, "
             f"{diagonal:g} m, not {edge_length!r}"
@@ -164,15 +170,8 @@ def tetrahedralize(points: np.ndarray, triangles: np.ndarray, edge_length: float
 # ---- files
 
 
-def _existing(path: str | os.PathLike[str]) -> Path:
-    path = Path(path)
-    if not path.is_file():
-        raise MeshError(f"{path}: {'is a directory, not a file' if path.is_dir() else 'no such file'}")
-    return path
-
-
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def _naming(path: str | Path) -> Iterator[None]:
     """Put the file's name in front of errors about what is in it."""
     try:
         yield
@@ -180,12 +179,32 @@ def _naming(path: Path) -> Iterator[None]:
         raise MeshError(f"{path}: {error}") from error
 
 
+def _require_meshio(path: Path) -> None:
+    if importlib.util.find_spec("meshio") is None:
+        raise MissingExtraError(f"reading {path.name}", "meshio", "mesh")
+
+
+def read_solid_file(path: str) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Points, cells, point sets and cell sets for :meth:`Mesh.repaired`; called in a child process."""
+    with _naming(path):
+        return _solid(_read_file(Path(path)))
+
+
+def read_surface_file(path: str) -> tuple[np.ndarray, np.ndarray]:
+    """Points and triangles of a surface; called in a child process."""
+    with _naming(path):
+        file = _read_file(Path(path))
+        faces = [block.data for block in file.cells if block.type in ("triangle", "quad", "polygon")]
+        fans = [face[:, [0, k, k + 1]] for face in faces for k in range(1, face.shape[1] - 1)]
+        if not fans:
+            raise MeshError("the file holds no triangles, quadrilaterals or polygons")
+        return file.points[:, :3], np.concatenate(fans)
+
+
 def _read_file(path: Path) -> Any:
     """The file as a ``meshio.Mesh``, with what meshio prints turned into errors and warnings."""
-    try:
-        import meshio
-    except ImportError as error:
-        raise MissingExtraError(f"reading {path.name}", "meshio", "mesh") from error
+    import meshio
+
     mark = _MARKS.get(path.suffix.lower())
     printed = io.StringIO()
     try:
@@ -194,15 +213,15 @@ def _read_file(path: Path) -> Any:
         with redirect_stdout(printed), redirect_stderr(printed):
             file = meshio.read(path)
     except (Exception, SystemExit) as error:  # meshio raises anything on damaged files, and may exit
-        reason = " ".join(printed.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise MeshError(f"the file is damaged, cut short or of an unknown format ({reason})") from error
-    if remarks := " ".join(printed.getvalue().split()):
+        reason = one_line(printed.getvalue()) or described(error)
+        raise MeshError(f"{DAMAGED} ({reason})") from error
+    if remarks := one_line(printed.getvalue()):
         warnings.warn(f"{path}: meshio says: {remarks}", stacklevel=3)
     return file
 
 
-def _solid(file: Any) -> Mesh:
-    """The mesh of the cells of the highest dimension in a ``meshio.Mesh``."""
+def _solid(file: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Points, cells of the highest dimension, point sets and cell sets of a ``meshio.Mesh``."""
     dim = max((block.dim for block in file.cells), default=0)
     if dim < 2:
         raise MeshError("the file holds no triangles or tetrahedra")
@@ -233,7 +252,7 @@ def _solid(file: Any) -> Mesh:
             cell_sets[name].append(offsets[number] + members)
         else:
             point_sets[name].append(block.data[members].ravel())
-    return Mesh.repaired(
+    return (
         points,
         cells,
         {name: np.concatenate(members) for name, members in point_sets.items()},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from warpfem.supports import Supports
 
 Route = Literal["tape", "closed", "assembled"]
+
+STIFFNESS_PART = 16384
+"""Cells whose dense stiffness is held at a time: 19 MB for tetrahedra, where that of a million takes 1.2 GB."""
 
 
 class State:
@@ -164,11 +168,16 @@ class CellBlock:
             parameters,
         ]
 
-    def launch(self, name: str, inputs: list, outputs: list, *, volume: bool = True) -> None:
-        """Launches the kernel of that name over the cells; ``volume`` is whether it takes their volumes."""
-        cells, inverse_shape, volumes, parameters = self.arguments
-        own = [cells, inverse_shape, volumes, parameters] if volume else [cells, inverse_shape, parameters]
-        wp.launch(getattr(self.kernels, name), self.count, inputs=[*own, *inputs], outputs=outputs, device=self.device)
+    def launch(self, name: str, inputs: list, outputs: list, *, part: slice | None = None) -> None:
+        """Launches the kernel of that name over the cells, or a part of them.
+
+        Of :attr:`arguments` it gets first those that it names.
+        """
+        kernel = getattr(self.kernels, name)
+        arrays = self.arguments if part is None else [array[part] for array in self.arguments]
+        known = dict(zip(("cells", "inverse_shape", "volume", "parameters"), arrays, strict=True))
+        own = [known[argument.label] for argument in kernel.adj.args if argument.label in known]
+        wp.launch(kernel, len(arrays[0]), inputs=[*own, *inputs], outputs=outputs, device=self.device)
 
 
 class Model:
@@ -204,10 +213,10 @@ class Model:
         self.scene = scene
         self.dtype = dtype
         self.dim = scene.dim
-        self.types = types(scene.dim, dtype)
+        self.types = types(scene.dim, str(dtype))
         try:
             self.device = wp.get_device(device)
-        except (RuntimeError, ValueError) as error:
+        except (RuntimeError, ValueError, TypeError) as error:
             known = ", ".join(str(known.alias) for known in wp.get_devices())
             raise SceneError(f"no device '{device}': there is {known}") from error
         meshes = [body.mesh for body in scene.bodies]
@@ -259,12 +268,13 @@ class Model:
             return [float(np.max(body.material.moduli.p_wave)) for body in bodies]
         # from each cell's own stiffness: the uniform stretch u = X_x e_x has the energy V/2 d²psi/dF_xx²
         modulus = np.zeros(self.cell_count)
-        for block, stiffness in zip(self.blocks, self.element_stiffness(), strict=True):
-            edges = np.linalg.inv(block.arguments[1].numpy().astype(np.float64))  # columns X_k - X_0
-            stretch = np.zeros((block.count, self.dim + 1, self.dim))
+        for block, part, stiffness in self.element_stiffness_parts():
+            _, inverse_shape, volume, _ = block.arguments
+            edges = np.linalg.inv(inverse_shape.numpy()[part].astype(np.float64))  # columns X_k - X_0
+            stretch = np.zeros((len(edges), self.dim + 1, self.dim))
             stretch[:, 1:, 0] = edges[:, 0, :]
             work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
-            modulus[block.index] = work / block.arguments[2].numpy()
+            modulus[block.index[part]] = work / volume.numpy()[part]
         return [float(modulus[a:b].max()) for a, b in zip(self.cell_starts, self.cell_starts[1:], strict=False)]
 
     def _slip_speed(self) -> float:
@@ -331,7 +341,7 @@ class Model:
         psi = np.empty(self.cell_count)
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch("density", [state.u], [out], volume=False)
+            block.launch("density", [state.u], [out])
             psi[block.index] = out.numpy()
         return psi
 
@@ -396,7 +406,7 @@ class Model:
 
         vectors = _point_vectors("the direction", direction, (self.point_count, self.dim))
         p = self._device_array(vectors, self.types.vector)
-        operator = tangent_operator(self, route, clamped=False, external=False)
+        operator = tangent_operator(self, route, external=False)
         operator.linearize(state.u, mass_weight=0.0)
         out = self.zeros()
         operator.apply(p, out)
@@ -409,17 +419,30 @@ class Model:
             For each block of :attr:`blocks` a float64 array (count, d+1, d, d+1, d) [N/m], indexed by
             point and component of the force, then of the displacement.
         """
+        parts: dict[CellBlock, list[np.ndarray]] = {block: [] for block in self.blocks}
+        for block, _, stiffness in self.element_stiffness_parts(u):
+            parts[block].append(stiffness)
+        return [np.concatenate(own) for own in parts.values()]
+
+    def element_stiffness_parts(self, u: wp.array | None = None) -> Iterator[tuple[CellBlock, slice, np.ndarray]]:
+        """:meth:`element_stiffness` a part of the cells at a time, which takes little memory.
+
+        Yields:
+            The block, the range of its cells, and their stiffness.
+        """
         if u is None:
             u = self.zeros()
         d, corners = self.dim, self.dim + 1
-        result = []
         for block in self.blocks:
-            slots = np.arange(block.count * corners**2, dtype=np.int32).reshape(block.count, corners, corners)
-            values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
-            block.launch("stiffness", [u, wp.array(slots, dtype=wp.int32, device=self.device)], [values])
-            entries = values.numpy().astype(np.float64).reshape(block.count, corners, corners, d, d)
-            result.append(entries.transpose(0, 1, 3, 2, 4))
-        return result
+            for start in range(0, block.count, STIFFNESS_PART):
+                part = slice(start, min(start + STIFFNESS_PART, block.count))
+                count = part.stop - start
+                slots = np.arange(count * corners**2, dtype=np.int32).reshape(count, corners, corners)
+                values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
+                slot_array = wp.array(slots, dtype=wp.int32, device=self.device)
+                block.launch("stiffness", [u, slot_array], [values], part=part)
+                entries = values.numpy().astype(np.float64).reshape(count, corners, corners, d, d)
+                yield block, part, entries.transpose(0, 1, 3, 2, 4)
 
     def stresses(self, state: State) -> Stresses:
         """Deformation gradients and stresses of every cell."""
@@ -429,7 +452,7 @@ class Model:
         u = state.displacement
         for block in self.blocks:
             out = wp.zeros(block.count, dtype=solid, device=self.device)
-            block.launch("stress", [state.u], [out], volume=False)
+            block.launch("stress", [state.u], [out])
             P[block.index] = out.numpy()
             corners = u[block.host_cells]
             edges = corners[:, 1:] - corners[:, :1]
@@ -467,7 +490,7 @@ class Model:
         for block in self.blocks:
             J = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
             stress = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            block.launch("diagnostics", [state.u], [J, stress], volume=False)
+            block.launch("diagnostics", [state.u], [J, stress])
             jacobian[block.index] = J.numpy()
             von_mises[block.index] = stress.numpy()
         return jacobian, von_mises
@@ -486,7 +509,7 @@ class Model:
 def _point_vectors(what: str, value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SimulationError(f"{what} must be numbers of shape {shape}, not {value!r}") from None
     if array.shape != shape:
         raise SimulationError(f"{what} must have shape {shape} for this model, not {array.shape}")

@@ -137,9 +137,9 @@ def _lame_parameters(first: str, a: np.ndarray, second: str, b: np.ndarray) -> t
 def _values(name: str, value: Parameter) -> np.ndarray:
     try:
         array = np.array(value, dtype=np.float64)  # a copy: what the caller does to theirs later has no effect
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise MaterialError(f"{name} must be a number or one number per cell, not {value!r}") from None
-    if array.ndim > 1:
+    if array.ndim > 1 or not array.size:
         raise MaterialError(f"{name} must be a number or one number per cell, not an array of shape {array.shape}")
     return array
 

@@ -76,6 +76,8 @@ def preview(path: str | Path, out: str | Path, *, frames: int | None = None) -> 
             missing, not an animation, or has no frames.
         MissingExtraError: Matplotlib or Pillow is not installed.
     """
+    if not isinstance(out, str | os.PathLike):
+        raise OutputError(f"the name of a preview must be a str or a path, not {out!r}")
     out = Path(out)
     _check_settings(out, frames)
     try:
@@ -99,12 +101,12 @@ def preview(path: str | Path, out: str | Path, *, frames: int | None = None) -> 
 def _check_settings(out: Path, frames: int | None) -> None:
     if out.suffix not in MOST_FRAMES:
         raise OutputError(f"{out}: the name of a preview must end in {' or '.join(MOST_FRAMES)}")
-    if out.is_dir():
+    if os.path.isdir(out):
         raise OutputError(f"{out} is a folder: give the name of a file")
-    if not os.access(out if out.exists() else out.parent, os.W_OK):
+    if not os.access(out if os.path.exists(out) else out.parent, os.W_OK):
         raise OutputError(f"{out} cannot be written: its folder does not exist, or writing is not permitted")
-    if frames is not None and frames < 1:
-        raise OutputError(f"{out}: a preview has at least 1 frame, not {frames}")
+    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, int) or frames < 1):
+        raise OutputError(f"{out}: a preview has at least 1 frame, not {frames!r}")
 
 
 # ---- the two kinds of pictures

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from warpfem.boundary import Load, Obstacle, Support, Vector
+from warpfem.boundary import Load, Obstacle, Support, Vector, is_number
 from warpfem.errors import SceneError, source_of, user_code
 from warpfem.materials import Material
 from warpfem.mesh import Mesh
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
 """One vector for all points, an array (point_count, dim), or a function of the rest points."""
+
+
+_MOST = 1e12
+"""The largest number of frames per second, time step [s] or damping [1/s]: what is beyond overflows in float32."""
 
 
 def _require_list(name: str, value: object) -> None:
@@ -65,7 +69,7 @@ class Body:
             _require_list(f"body '{self.name}': {name}", getattr(self, name))
         try:
             density = np.array(self.density, dtype=np.float64)  # a copy, as of all that a caller may change later
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise SceneError(f"body '{self.name}': density must be a number, not {self.density!r}") from None
         if density.ndim > 1 or (density.ndim == 1 and len(density) != self.mesh.cell_count):
             raise SceneError(
@@ -100,7 +104,7 @@ class Body:
                 value = value(self.mesh.points.copy())
         try:
             array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise SceneError(f"body '{self.name}': initial {name} must be numbers, not {value!r}") from None
         if array.shape not in (shape, shape[1:]):
             raise SceneError(
@@ -164,13 +168,13 @@ class Scene:
             raise SceneError(f"solver must be a warpfem solver, for example BackwardEuler(), not {self.solver!r}")
         self._check_number("fps", self.fps, positive=True)
         self._check_number("damping", self.damping)
-        if self.dt != "auto":
+        if not isinstance(self.dt, str) or self.dt != "auto":
             self._check_number("dt", self.dt, positive=True)
         if isinstance(self.frames, bool) or not isinstance(self.frames, (int, np.integer)) or self.frames < 0:
             raise SceneError(f"frames must be an integer >= 0, not {self.frames!r}")
-        if self.up_axis not in ("Y", "Z"):
+        if not isinstance(self.up_axis, str) or self.up_axis not in ("Y", "Z"):
             raise SceneError(f"up_axis must be 'Y' or 'Z', not {self.up_axis!r}")
-        if self.color_by not in ("von_mises", "jacobian"):
+        if not isinstance(self.color_by, str) or self.color_by not in ("von_mises", "jacobian"):
             raise SceneError(f"color_by must be 'von_mises' or 'jacobian', not {self.color_by!r}")
         if self.gravity is not None:
             self._check_vector("gravity", self.gravity)
@@ -182,14 +186,15 @@ class Scene:
             self._check_vector(f"{type(obstacle).__name__}: its place", vector)
 
     def _check_number(self, name: str, value: object, positive: bool = False) -> None:
-        number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-        if not number or not np.isfinite(value) or value < 0.0 or (positive and value == 0.0):  # type: ignore
+        if not is_number(value) or value < 0.0 or (positive and value == 0.0):  # type: ignore[operator]
             raise SceneError(f"{name} must be a finite number {'> 0' if positive else '>= 0'}, not {value!r}")
+        if value > _MOST or (positive and value * _MOST < 1.0):  # type: ignore[operator]
+            raise SceneError(f"{name} must be a number between {1.0 / _MOST:g} and {_MOST:g}, not {value!r}")
 
     def _check_vector(self, name: str, value: Vector) -> None:
         try:
             vector = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise SceneError(f"{name} must be a vector of {self.dim} numbers, not {value!r}") from None
         if vector.shape != (self.dim,) or not np.isfinite(vector).all():
             raise SceneError(

@@ -6,6 +6,7 @@ import ast
 import difflib
 import importlib.util
 import inspect
+import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -41,7 +42,7 @@ def load_scene(path: str | Path, settings: Mapping[str, str] | None = None) -> S
 
 
 def _scene_function(path: Path) -> Callable[..., Any]:
-    if not path.is_file():
+    if not os.path.isfile(path):  # unlike the path's own method it bears any name
         raise SceneError(f"no scene file '{path}'")
     if path.suffix != ".py":
         raise SceneError(f"'{path}' is not a scene file: it must end in .py and define scene() -> Scene")
@@ -72,7 +73,10 @@ def _call(path: Path, action: Callable[[], Any]) -> Any:
 
 
 def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:
-    parameters = inspect.signature(function).parameters
+    try:
+        parameters = inspect.signature(function).parameters
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"{path}: scene must be a function scene(**parameters) -> Scene, not {function!r}") from error
     arguments = {}
     for name, text in settings.items():
         if name not in parameters:
@@ -92,12 +96,12 @@ def _value(path: Path, name: str, text: str, default: Any) -> Any:
         return text
     try:
         value = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):  # literal_eval's, for odd texts
         value = text
     if isinstance(default, float) and not isinstance(value, bool):
         try:
             return float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             pass  # reported below
     if default is not inspect.Parameter.empty and default is not None and type(value) is not type(default):
         raise SceneError(f"{path}: {name} must be of type {type(default).__name__}, like {default!r}, not {text!r}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -64,6 +65,7 @@ class Summary:
         largest_penetration: over all frames [m].
         newton_iterations, cg_iterations: totals over all steps.
         rounded_steps: implicit steps that rounding kept from their tolerance, with a residual below 1e-2.
+        divided_steps: implicit steps that failed as a whole and were taken in parts.
         unconverged_steps: implicit steps that stopped before their tolerance for other reasons, or above 1e-2.
         worst_residual: the largest relative residual among both.
         worst_note: how that step ended.
@@ -84,6 +86,7 @@ class Summary:
     newton_iterations: int = 0
     cg_iterations: int = 0
     rounded_steps: int = 0
+    divided_steps: int = 0
     unconverged_steps: int = 0
     worst_residual: float = 0.0
     worst_note: str = ""
@@ -150,6 +153,7 @@ class Simulation:
         self.solver = solver or scene.solver
         self.stepper = self.solver.stepper(self.model)
         interval = 1.0 / scene.fps
+        self._warned: set[str] = set()  # bodies whose inverted cells have been told of
         self.steps_per_frame = max(1, math.ceil(interval / self._wanted_dt(interval) - 1e-9))
         self.dt = interval / self.steps_per_frame
         if scene.frames > 0:
@@ -220,6 +224,7 @@ class Simulation:
         summary.simulated_seconds = self.state.time
         summary.newton_iterations += report.newton_iterations
         summary.cg_iterations += report.cg_iterations
+        summary.divided_steps += report.parts > 1
         if report.note:
             summary.rounded_steps += report.converged
             summary.unconverged_steps += not report.converged
@@ -241,6 +246,7 @@ class Simulation:
                 f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). A smaller dt, or a material that "
                 "bears inversion (StableNeoHookean), may help"
             )
+        self._warn_of_inverted_cells(jacobian)
         return Frame(
             index=index,
             time=state.time,
@@ -251,6 +257,21 @@ class Simulation:
             energies=model.energies(state),
             penetration=0.0 if model.contact is None else model.contact.depth(displacement),
         )
+
+    def _warn_of_inverted_cells(self, jacobian: np.ndarray) -> None:
+        """Warns, once for each body: the energies of most materials have other minima than the rest shape there."""
+        for body, (_, cells) in zip(self.scene.bodies, body_slices(self.model), strict=True):
+            inverted = np.flatnonzero(jacobian[cells] <= 0.0)
+            if len(inverted) and body.name not in self._warned and not body.material.constitutive.convex:
+                self._warned.add(body.name)
+                kind = type(body.material).__name__
+                warnings.warn(
+                    f"t = {self.state.time:.6g} s: {len(inverted)} of {body.mesh.cell_count} cells of body "
+                    f"'{body.name}' are inverted (the first is cell {inverted[0]}, J = "
+                    f"{jacobian[cells][inverted[0]]:.4g}): "
+                    + ("it may fold" if body.material.resists_mirroring else f"{kind} does not turn them back"),
+                    stacklevel=2,
+                )
 
 
 def body_slices(model: Model) -> list[tuple[slice, slice]]:

@@ -148,8 +148,8 @@ class Supports:
     @staticmethod
     def _axes(body: Body, support: Pin | PrescribedMotion) -> tuple[int, ...]:
         dim = body.mesh.dim
-        axes = range(dim) if support.axes is None else np.atleast_1d(support.axes).tolist()
-        if not axes or any(isinstance(axis, bool | float) or axis not in range(dim) for axis in axes):
+        axes = range(dim) if support.axes is None else np.array(support.axes, dtype=object, ndmin=1).tolist()
+        if not axes or any(isinstance(axis, bool | np.bool_ | float) or axis not in range(dim) for axis in axes):
             raise SceneError(
                 f"body '{body.name}', {type(support).__name__}: axes {support.axes!r} must be among 0..{dim - 1}"
             )

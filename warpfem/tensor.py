@@ -155,6 +155,24 @@ def log1p(y: Any):
 
 
 @wp.func
+def volume_ratio(H: Any):
+    """J = det(I + H): from J - 1 near rest, from F under compression, where J - 1 would keep no digits of J."""
+    j = volume_change(H)
+    if j < H.dtype(-0.5):
+        return wp.determinant(deformation_gradient(H))
+    return H.dtype(1.0) + j
+
+
+@wp.func
+def log_volume_ratio(H: Any):
+    """ln J, accurate near rest and under compression; not a number for J < 0."""
+    j = volume_change(H)
+    if j < H.dtype(-0.5):
+        return wp.log(wp.determinant(deformation_gradient(H)))
+    return log1p(j)
+
+
+@wp.func
 def embed(H: mat22):
     """Plane strain: the 3x3 displacement gradient diag(H, 0)."""
     zero = H.dtype(0.0)
@@ -381,6 +399,17 @@ def skew(w: Any):
 
 
 @wp.func
+def _least_stretch_sum(like: wp.float32):
+    """The relative size below which rounding hides the sum of two singular values."""
+    return wp.float32(1.0e-6)
+
+
+@wp.func
+def _least_stretch_sum(like: wp.float64):
+    return wp.float64(1.0e-14)
+
+
+@wp.func
 def _rotation_rate(R: mat33, F: mat33, G: mat33):
     """The vector w with R^T dR = skew(w) when F changes by G: (tr(S) I - S) w = axial(R^T G - G^T R).
 
@@ -391,7 +420,7 @@ def _rotation_rate(R: mat33, F: mat33, G: mat33):
     T = wp.transpose(R) * G
     axial = wp.vector(T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1])
     size = wp.trace(A)
-    floor = F.dtype(1.0e-6) * wp.abs(size) * size * size + F.dtype(1.0e-30)
+    floor = _least_stretch_sum(size) * wp.abs(size) * size * size + F.dtype(1.0e-30)
     determinant = wp.determinant(A)
     if wp.abs(determinant) < floor:
         determinant = floor
@@ -404,7 +433,7 @@ def rotation_differential(F: mat22, G: mat22):
     R = polar_rotation(F)
     T = wp.transpose(R) * G
     stretch = wp.length(wp.vector(F[0, 0] + F[1, 1], F[1, 0] - F[0, 1]))
-    floor = F.dtype(1.0e-6) * wp.sqrt(wp.ddot(F, F)) + F.dtype(1.0e-30)
+    floor = _least_stretch_sum(stretch) * wp.sqrt(wp.ddot(F, F)) + F.dtype(1.0e-30)
     w = (T[1, 0] - T[0, 1]) / wp.max(stretch, floor)
     zero = F.dtype(0.0)
     return R * wp.matrix_from_rows(wp.vector(zero, -w), wp.vector(w, zero))

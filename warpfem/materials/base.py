@@ -25,6 +25,9 @@ class Constitutive:
         parameter_count: length of the vector of parameters.
         isotropic: whether psi depends on the principal stretches of F alone.
         convex: whether d²psi/dF² is positive semi-definite for every F.
+        corotated: whether P holds the rotation of F, whose derivative has no bound where the sum of two singular
+            values nears 0.
+        barrier: whether psi is infinite for J <= 0, so that a step may not lead there.
         differentiable: whether Warp can differentiate ``stress``: not if it calls ``wp.grad``, through which
             gradients silently do not flow.
     """
@@ -35,6 +38,8 @@ class Constitutive:
     parameter_count: int = 2
     isotropic: bool = True
     convex: bool = False
+    corotated: bool = False
+    barrier: bool = False
     differentiable: bool = True
 
 
@@ -42,6 +47,8 @@ class Material(ABC):
     """Base of all materials: the functions and the parameters of a hyperelastic solid."""
 
     name: ClassVar[str]
+    resists_mirroring: ClassVar[bool] = True
+    """Whether a mirrored cell has more energy than one at rest."""
 
     @property
     @abstractmethod

@@ -161,7 +161,7 @@ class EnergyMaterial(Material):
             try:
                 values[name] = np.array(value, dtype=np.float64)
                 finite = bool(np.isfinite(values[name]).all())
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 finite = False
             if not finite:
                 raise MaterialError(f"EnergyMaterial: parameter '{name}' must be finite numbers, not {value!r}")

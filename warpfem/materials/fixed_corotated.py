@@ -65,4 +65,4 @@ class FixedCorotated(HookeanMaterial):
 
     name = "fixed_corotated"
     least_nu = 0.0
-    functions = Constitutive(energy_density, stress, stress_differential)
+    functions = Constitutive(energy_density, stress, stress_differential, corotated=True)

@@ -10,39 +10,44 @@ from warpfem.tensor import (
     deformation_gradient,
     distortion,
     identity_like,
-    log1p,
     log1p_deficit,
+    log_volume_ratio,
     volume_change,
+    volume_ratio,
 )
 
 
 @wp.func
 def energy_density(H: Any, parameters: Any):
     half = H.dtype(0.5)
-    j = volume_change(H)
-    if not (j > H.dtype(-1.0)):
+    J = volume_ratio(H)
+    if not (H.dtype(0.0) < J):
         return H.dtype(wp.inf)
-    log_j = log1p(j)
-    return parameters[0] * (half * distortion(H) + log1p_deficit(j)) + half * parameters[1] * log_j * log_j
+    log_j = log_volume_ratio(H)
+    j = volume_change(H)
+    deficit = j - log_j  # j - ln(1 + j)
+    if j > H.dtype(-0.5):
+        deficit = log1p_deficit(j)
+    return parameters[0] * (half * distortion(H) + deficit) + half * parameters[1] * log_j * log_j
 
 
 @wp.func
 def stress(H: Any, parameters: Any):
     # P = tau F^-T with the Kirchhoff stress tau = mu (F F^T - I) + lam ln(J) I
-    j = volume_change(H)
     transposed = wp.transpose(H)
-    kirchhoff = parameters[0] * (H + transposed + H * transposed) + (parameters[1] * log1p(j)) * identity_like(H)
-    return (kirchhoff * cofactor(deformation_gradient(H))) / (H.dtype(1.0) + j)
+    kirchhoff = parameters[0] * (H + transposed + H * transposed) + (
+        parameters[1] * log_volume_ratio(H)
+    ) * identity_like(H)
+    return (kirchhoff * cofactor(deformation_gradient(H))) / volume_ratio(H)
 
 
 @wp.func
 def stress_differential(H: Any, dH: Any, parameters: Any):
     # dP = mu dF + (mu - lam ln J) F^-T dF^T F^-T + lam (F^-T : dF) F^-T
-    j = volume_change(H)
-    G = cofactor(deformation_gradient(H)) / (H.dtype(1.0) + j)
+    G = cofactor(deformation_gradient(H)) / volume_ratio(H)
     return (
         parameters[0] * dH
-        + (parameters[0] - parameters[1] * log1p(j)) * (G * wp.transpose(dH) * G)
+        + (parameters[0] - parameters[1] * log_volume_ratio(H)) * (G * wp.transpose(dH) * G)
         + (parameters[1] * wp.ddot(G, dH)) * G
     )
 
@@ -56,4 +61,4 @@ class NeoHookean(HookeanMaterial):
 
     name = "neo_hookean"
     least_nu = 0.0
-    functions = Constitutive(energy_density, stress, stress_differential)
+    functions = Constitutive(energy_density, stress, stress_differential, barrier=True)

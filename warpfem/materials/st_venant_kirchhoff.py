@@ -44,8 +44,10 @@ class StVenantKirchhoff(HookeanMaterial):
     """St. Venant-Kirchhoff: psi = mu |E|^2 + lam/2 (tr E)^2 with E = (F^T F - I)/2 (Sifakis and Barbic 2012).
 
     P = F (2 mu E + lam (tr E) I). For large rotations and moderate strains: it softens under uniaxial
-    compression below a stretch of 1/sqrt(3), and nothing keeps a cell from inverting.
+    compression below a stretch of 1/sqrt(3), and nothing keeps a cell from inverting, or turns it back: a mirrored
+    cell has no energy.
     """
 
     name = "st_venant_kirchhoff"
+    resists_mirroring = False
     functions = Constitutive(energy_density, stress, stress_differential)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +26,8 @@ class StepReport:
         residual: unbalanced force over the largest of the forces acting, at the end; 0 for explicit steps,
             the linear solver's relative residual for linearised ones.
         converged: whether the residual met the tolerance, or is below ``ROUNDING_LIMIT`` and lost in rounding.
+        rounded: whether rounding hides what is left of the residual, so that no other step would do better.
+        parts: steps that this one was divided into.
         note: how the step ended, if not by its tolerance.
     """
 
@@ -33,13 +35,31 @@ class StepReport:
     cg_iterations: int = 0
     residual: float = 0.0
     converged: bool = True
+    rounded: bool = False
+    parts: int = 1
     note: str = ""
+
+    def __add__(self, other: StepReport) -> StepReport:
+        """The report of this step and the next as one; its end is that of the worse."""
+        worse = self if (not self.converged, self.residual) >= (not other.converged, other.residual) else other
+        return replace(
+            worse,
+            newton_iterations=self.newton_iterations + other.newton_iterations,
+            cg_iterations=self.cg_iterations + other.cg_iterations,
+            parts=self.parts + other.parts,
+        )
 
 
 class Stepper(ABC):
-    """Advances states of one model. Holds the work arrays, never the state."""
+    """Advances states of one model. Holds the work arrays, never the state.
+
+    Attributes:
+        model: the model.
+        attempt: displacements at which the last step failed, device array, where there are other than the state's.
+    """
 
     model: Model
+    attempt: wp.array | None = None
 
     @abstractmethod
     def step(self, state: State, dt: float) -> StepReport:

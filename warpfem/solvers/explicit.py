@@ -47,11 +47,11 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
     """
     corners = model.dim + 1
     largest = 0.0
-    for block, stiffness in zip(model.blocks, model.element_stiffness(u), strict=True):
-        density = np.concatenate([np.broadcast_to(body.density, body.mesh.cell_count) for body in model.scene.bodies])
-        volume = block.arguments[2].numpy().astype(np.float64)
-        mass = density[block.index] * volume / corners
-        A = stiffness.reshape(block.count, corners * model.dim, -1) / mass[:, None, None]
+    density = np.concatenate([np.broadcast_to(body.density, body.mesh.cell_count) for body in model.scene.bodies])
+    for block, part, stiffness in model.element_stiffness_parts(u):
+        volume = block.arguments[2].numpy()[part].astype(np.float64)
+        mass = density[block.index[part]] * volume / corners
+        A = stiffness.reshape(len(mass), corners * model.dim, -1) / mass[:, None, None]
         scale = np.linalg.norm(A, axis=(1, 2))
         A = A / np.where(scale > 0.0, scale, 1.0)[:, None, None]
         A = A @ A

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpfem.dtypes import types
 from warpfem.errors import SceneError, SimulationError
-from warpfem.linear import ConjugateGradients, LinearStatus, tangent_operator
+from warpfem.linear import ConjugateGradients, Hessian, LinearStatus, tangent_operator
 from warpfem.model import Model, Route, State
 from warpfem.points import CHUNK, chunks
 from warpfem.solvers.base import (
@@ -22,6 +22,9 @@ from warpfem.solvers.base import (
     require_positive,
     worst_cell,
 )
+
+MAX_HALVINGS = 10
+"""How often a step that fails is halved before it is refused."""
 
 FRICTION_UPDATES = 10
 """Newton iterations of a step that take the friction limits of their iterate; later ones keep the last, so that
@@ -127,19 +130,64 @@ class _BackwardEulerStepper(Stepper):
         self.model = model
         self.config = config
         self.kernels = _implicit_kernels(model.dim, model.dtype)
-        self.operator = tangent_operator(model, config.differential, clamped=config.hessian == "clamped")
+        self.operator = tangent_operator(model, config.differential)
         self.cg = ConjugateGradients(model)
         self._u, self._trial, self._predicted, self._force, self._part, self._direction = (
             model.zeros() for _ in range(6)
         )
         self._sum = wp.zeros(1, dtype=wp.float64, device=model.device)
+        self._barriers = [block for block in model.blocks if block.kernels.constitutive.barrier]
+        self._limit = wp.zeros(1, dtype=model.types.scalar, device=model.device) if self._barriers else None
 
     def arrays(self) -> list[wp.array]:
         own = [self._u, self._trial, self._predicted, self._force, self._part, self._direction, self._sum]
+        if self._limit is not None:
+            own.append(self._limit)
         return [*own, *self.cg.arrays(), *self.operator.arrays()]
 
     def step(self, state: State, dt: float) -> StepReport:
         require_positive(dt)
+        self.attempt = None
+        try:
+            return self._single_step(state, dt)
+        except SimulationError as failure:
+            hopeless = not np.isfinite(self.model.elastic_energy(state.u))
+            if self.config.unconverged == "accept" or hopeless:
+                raise
+            return self._step_in_parts(state, dt, failure)
+
+    def _step_in_parts(self, state: State, dt: float, failure: SimulationError) -> StepReport:
+        """Two steps of half the length, and so on where one fails; puts the state back if the last one does."""
+        start = state.copy()
+        lengths = [0.5 * dt, 0.5 * dt]
+        report: StepReport | None = None
+        while lengths:
+            try:
+                part = self._single_step(state, lengths[-1])
+            except SimulationError as error:
+                if lengths[-1] < 1.5 * dt / 2**MAX_HALVINGS:
+                    self.attempt = self._u
+                    wp.copy(state.u, start.u)
+                    wp.copy(state.v, start.v)
+                    state.time = start.time
+                    state.revision += 1
+                    raise SimulationError(
+                        f"t = {start.time:.6g} s: the step of {dt:.4g} s cannot be solved, nor in parts of "
+                        f"{lengths[-1]:.3g} s: {error}"
+                    ) from failure
+                lengths += [0.5 * lengths.pop()] * 2
+                continue
+            lengths.pop()
+            report = part if report is None else report + part
+        state.time = start.time + dt
+        return report
+
+    def _single_step(self, state: State, dt: float) -> StepReport:
+        """One step, by which ``state`` changes only if it succeeds.
+
+        Raises:
+            SimulationError: it does not.
+        """
         model = self.model
         time = state.time + dt
         damping = model.scene.damping
@@ -151,6 +199,10 @@ class _BackwardEulerStepper(Stepper):
         if model.contact is not None:
             model.contact.limit_friction(state.u)
         report = self._newton(state, time) if self.config.max_iterations > 1 else self._linearised(state, time)
+        if not (report.converged or report.rounded or self.config.unconverged == "accept"):
+            raise SimulationError(
+                f"{report.note}, with a residual of {report.residual:.1e}; {worst_cell(model, self._u)}"
+            )
         # v = (u - u_t) / dt, then u
         self._launch("add_scaled", [self._u, -1.0, state.u], [self._part])
         state.v.zero_()
@@ -168,7 +220,7 @@ class _BackwardEulerStepper(Stepper):
         self._force.fill_(1.0)
         if self.model.supports is not None:
             self.model.supports.project(self._force)
-        self._linearize(self._u)
+        self._linearize("exact")
         self.cg.solve(self.operator, self._force, self._direction, tolerance=0.5, max_iterations=1)
         self._rounding_force(self._u)
 
@@ -181,13 +233,13 @@ class _BackwardEulerStepper(Stepper):
         self._hold(self._u)
         self._unbalanced_force(self._u)
         require_finite(self.model, self._force, "the force", time)
-        self._linearize(self._u)
+        self._linearize(self.config.hessian)
         result = self._solve(self.config.linear_tolerance)
         self._launch("add_scaled", [self._u, 1.0, self._direction], [self._u])
         require_finite(self.model, self._u, "the displacement", time)
         converged = result.status is LinearStatus.CONVERGED
         note = "" if converged else f"conjugate gradients {result.status.value}"
-        return StepReport(1, result.iterations, result.residual, converged, note)
+        return StepReport(1, result.iterations, result.residual, converged, note=note)
 
     # --- Newton's method --------------------------------------------------------------------------------
 
@@ -196,6 +248,8 @@ class _BackwardEulerStepper(Stepper):
         rough = model.contact is not None and model.contact.rough
         potential = self._choose_start(state)
         if not np.isfinite(potential):
+            require_finite(model, state.u, "the displacement", state.time)
+            require_finite(model, state.v, "the velocity", state.time)
             raise SimulationError(
                 f"t = {time:.6g} s: the step starts from infinite energy; {worst_cell(model, self._u)}. Start from a "
                 "state with J > 0, move supports more slowly, or take StableNeoHookean, which bears inversion"
@@ -214,20 +268,36 @@ class _BackwardEulerStepper(Stepper):
                 return StepReport(solves, cg_iterations, relative)
             if iteration == config.max_iterations:
                 break
-            self._linearize(self._u)
-            if residual <= self._rounding_force(self._u):
-                note = f"resolved only to the rounding of {model.dtype}"
-                return StepReport(solves, cg_iterations, relative, relative <= ROUNDING_LIMIT, note)
+            self._linearize("exact")
+            rounding = self._rounding_force(self._u)
+            if residual <= rounding:
+                return self._rounded(solves, cg_iterations, relative)
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             result = self._solve(forcing)
             solves += 1
             cg_iterations += result.iterations
-            found = self._line_search(potential, scale) if config.line_search else self._full_step()
+            if result.status is LinearStatus.CURVATURE and config.hessian != "exact":
+                self._linearize(config.hessian)
+                result = self._solve(forcing)
+                solves += 1
+                cg_iterations += result.iterations
+            if not config.line_search:
+                self._launch("add_scaled", [self._u, 1.0, self._direction], [self._u])
+                continue
+            slope = -model.dot(self._force, self._direction)
+            noise = 16.0 * model.types.epsilon * abs(potential) + rounding * model.dot(self._u, self._u) ** 0.5
+            found = self._line_search(potential, slope, noise)
             if found is None:
+                if -slope <= noise:
+                    return self._rounded(solves, cg_iterations, relative)
                 note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
                 break
             potential = found
-        return StepReport(solves, cg_iterations, relative, False, note)
+        return StepReport(solves, cg_iterations, relative, False, note=note)
+
+    def _rounded(self, solves: int, cg_iterations: int, relative: float) -> StepReport:
+        note = f"resolved only to the rounding of {self.model.dtype}"
+        return StepReport(solves, cg_iterations, relative, relative <= ROUNDING_LIMIT, rounded=True, note=note)
 
     def _choose_start(self, state: State) -> float:
         """Starts from the old state or from free flight, whichever has less potential."""
@@ -249,33 +319,37 @@ class _BackwardEulerStepper(Stepper):
             arguments = [self._predicted, model.dead_load, model.inverse_mass, 1.0 / self._weight]
             self._launch("free_flight", arguments, [u_out])
 
-    def _line_search(self, potential: float, scale: float) -> float | None:
+    def _line_search(self, potential: float, slope: float, noise: float) -> float | None:
         """Backtracks from the full step until the potential falls enough (Armijo); None if it never does.
 
-        Near the minimum the fall drowns in the rounding of the potential: about the work of the forces, of
-        norm ``scale``, over one rounding of u. There the slope decides, which rounding spares (after Hager and
-        Zhang 2005): a step will do that still descends at its end, or a full one that overshoots by half.
+        Where a material does not bear inversion, the full step is the longest that keeps J > 0. Near the minimum
+        the fall drowns in the rounding of the potential, ``noise``. There the slope decides, which rounding
+        spares (after Hager and Zhang 2005): a step will do that still descends at its end, or a full one that
+        overshoots by half.
         """
         model = self.model
-        slope = -model.dot(self._force, self._direction)
-        noise = 16.0 * model.types.epsilon * (abs(potential) + scale * model.dot(self._u, self._u) ** 0.5)
-        length = 1.0
+        length = full = self._longest_step()
         for _ in range(40):
             self._launch("add_scaled", [self._u, length, self._direction], [self._trial])
             value = self._potential(self._trial)
             fell = value <= potential + 1e-4 * length * slope
             if not fell and value <= potential + noise:
                 self._unbalanced_force(self._trial)
-                fell = -model.dot(self._force, self._direction) <= (-0.5 * slope if length == 1.0 else 0.0)
+                fell = -model.dot(self._force, self._direction) <= (-0.5 * slope if length == full else 0.0)
             if fell:
                 self._u, self._trial = self._trial, self._u
                 return value
             length *= 0.5
         return None
 
-    def _full_step(self) -> float:
-        self._launch("add_scaled", [self._u, 1.0, self._direction], [self._u])
-        return np.inf
+    def _longest_step(self) -> float:
+        """1, or nine tenths of what takes the first cell that does not bear inversion to J = 0."""
+        if self._limit is None:
+            return 1.0
+        self._limit.fill_(1.0 / 0.9)
+        for block in self._barriers:
+            block.launch("step_limit", [self._u, self._direction], [self._limit])
+        return 0.9 * float(self._limit.numpy()[0])
 
     # --- terms ------------------------------------------------------------------------------------------
 
@@ -328,9 +402,9 @@ class _BackwardEulerStepper(Stepper):
             model.supports.project(force)
         return float(np.sqrt(model.dot(force, force))), float(np.sqrt(max(sizes)))
 
-    def _linearize(self, u: wp.array) -> None:
+    def _linearize(self, hessian: Hessian) -> None:
         friction = None if self.model.contact is None else (self._start, self._dt)
-        self.operator.linearize(u, self._weight, friction=friction, precondition=True)
+        self.operator.linearize(self._u, self._weight, hessian=hessian, friction=friction, precondition=True)
 
     def _solve(self, tolerance: float):
         return self.cg.solve(
@@ -361,20 +435,26 @@ class BackwardEuler(Solver):
         tolerance: largest accepted norm of the unbalanced force, relative to the largest of inertia,
             internal force, load and contact; it does not depend on units, dt or mesh size.
         max_iterations: Newton iterations; 1 takes the linearised step.
-        hessian: "clamped" makes each element's stiffness positive semi-definite by setting negative
-            eigenvalues to zero (Teran et al. 2005); "exact" leaves it, and directions of negative curvature
-            end the linear solve. Materials that are not isotropic always use "exact".
+        hessian: what Newton's method does where the stiffness is not positive definite, which the linear solve
+            notices: "absolute" takes the absolute values of each cell's eigenvalues (Chen et al. 2024),
+            "clamped" sets the negative ones to zero (Teran et al. 2005), "exact" goes along the direction of
+            negative curvature. A linearised step takes them everywhere. Materials that are not isotropic
+            always use "exact".
         differential: route of the stiffness product: "assembled", "closed" or "tape".
         line_search: whether steps are shortened until the potential falls.
+        unconverged: what becomes of a step that misses the tolerance, unless rounding hides the rest: "halve"
+            does it again in two halves, and so on ``MAX_HALVINGS`` times, then raises a SimulationError and leaves
+            the state as it was; "accept" keeps what was reached and reports it.
         linear_tolerance: relative residual of the linear solve of a linearised step.
         linear_iterations: limit of conjugate gradients for one linear solve.
     """
 
     tolerance: float = 1e-4
     max_iterations: int = 50
-    hessian: Literal["clamped", "exact"] = "clamped"
+    hessian: Hessian = "absolute"
     differential: Route = "assembled"
     line_search: bool = True
+    unconverged: Literal["halve", "accept"] = "halve"
     linear_tolerance: float = 1e-5
     linear_iterations: int = 2000
 
@@ -390,27 +470,36 @@ class BackwardEuler(Solver):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise SceneError(f"BackwardEuler: {name} must be an integer >= 1, not {value!r}")
-        if self.hessian not in ("clamped", "exact"):
-            raise SceneError(f"BackwardEuler: hessian must be 'clamped' or 'exact', not {self.hessian!r}")
-        if self.differential not in ("assembled", "closed", "tape"):
-            raise SceneError(
-                f"BackwardEuler: differential must be 'assembled', 'closed' or 'tape', not {self.differential!r}"
-            )
-        if self.differential == "tape" and self.hessian == "clamped":
-            raise SceneError("BackwardEuler: the tape cannot clamp: take hessian='exact'")
+        for name, choices in (
+            ("hessian", ("absolute", "clamped", "exact")),
+            ("unconverged", ("halve", "accept")),
+            ("differential", ("assembled", "closed", "tape")),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in choices:
+                listed = f"{', '.join(map(repr, choices[:-1]))} or {choices[-1]!r}"
+                raise SceneError(f"BackwardEuler: {name} must be {listed}, not {value!r}")
+        if self.differential == "tape" and self.hessian != "exact":
+            raise SceneError("BackwardEuler: the tape cannot filter eigenvalues: take hessian='exact'")
 
     @classmethod
-    def linearised(cls, differential: Route = "assembled", linear_tolerance: float = 1e-5) -> "BackwardEuler":
+    def linearised(
+        cls, differential: Route = "assembled", linear_tolerance: float = 1e-5, hessian: Hessian = "exact"
+    ) -> "BackwardEuler":
         """One linear solve a step: (M + dt^2 K(u_t)) v = M v_t + dt f(u_t) (Hu 2020, eq. 11).
+
+        The K of the lecture is "exact"; "absolute" keeps steps bounded that start far from rest.
+
 
         Friction is a drag fitted to the speed of the step's start: sliding points slow down by Coulomb's law
         and sticking ones creep, but a point that comes loose takes many steps to.
         """
         return cls(
             max_iterations=1,
-            hessian="exact",
+            hessian=hessian,
             differential=differential,
             line_search=False,
+            unconverged="accept",
             linear_tolerance=linear_tolerance,
         )
 

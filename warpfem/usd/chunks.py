@@ -15,6 +15,7 @@ from warpfem.errors import OutputError
 from warpfem.files import beside, remove, replacing, settle
 from warpfem.usd.prims import WORLD, set_clock
 from warpfem.usd.saved import Chunk, partial_path
+from warpfem.usd.stages import trust
 
 Samples: TypeAlias = dict[Sdf.Path, Any]
 
@@ -182,6 +183,7 @@ class ChunkedLayer:
             root.GetPrimAtPath(WORLD).SetInfo("clips", {"default": clips})
         with replacing(self.path) as temporary:  # exporting would use a temporary file of its own
             temporary.write_text(root.ExportToString(), encoding="utf-8")
+        trust(self.path, map(str, self._folder.glob("*.usdc")))
 
     def _describe(self, layer: Sdf.Layer, metadata: dict[str, Any]) -> None:
         set_clock(layer, self._static.framesPerSecond, self.frame_count)

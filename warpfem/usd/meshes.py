@@ -1,4 +1,4 @@
-"""Meshes out of USD files that others made."""
+"""Meshes out of USD files that others made, which are opened in a child process alone."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from warpfem.child import read_in_child
 from warpfem.errors import MeshError
 from warpfem.usd.stages import at_rest, open_stage, reporting, world_matrix
 
@@ -30,17 +31,7 @@ def read_tet_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         MeshError: a file that is missing or unreadable, no ``TetMesh`` or several, an empty one, or indices
             out of range.
     """
-    stage = open_stage(path, MeshError)
-    with reporting(f"{path} cannot be read as USD", MeshError):
-        prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.TetMesh)]
-        if len(prims) != 1:
-            found = ", ".join(str(prim.GetPath()) for prim in prims) or "none"
-            raise MeshError(f"{path}: there must be one TetMesh in the file, found: {found}")
-        mesh = UsdGeom.TetMesh(prims[0])
-        cells = np.array(at_rest(mesh.GetTetVertexIndicesAttr()) or [], np.int32).reshape(-1, 4)
-        points, mirrored = _world_points(mesh)
-    _check_indices(f"{path}, {mesh.GetPath()}", cells.reshape(-1), len(points))
-    return points, cells[:, [0, 2, 1, 3]] if mirrored else cells
+    return read_in_child(tet_mesh, path, MeshError)
 
 
 def read_surface_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -60,6 +51,26 @@ def read_surface_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         MeshError: a file that is missing or unreadable, no ``Mesh``, an empty one, or indices that do not
             fit.
     """
+    return read_in_child(surface_mesh, path, MeshError)
+
+
+def tet_mesh(path: str) -> tuple[np.ndarray, np.ndarray]:
+    """What :func:`read_tet_mesh` returns; called in a child process."""
+    stage = open_stage(path, MeshError)
+    with reporting(f"{path} cannot be read as USD", MeshError):
+        prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.TetMesh)]
+        if len(prims) != 1:
+            found = ", ".join(str(prim.GetPath()) for prim in prims) or "none"
+            raise MeshError(f"{path}: there must be one TetMesh in the file, found: {found}")
+        mesh = UsdGeom.TetMesh(prims[0])
+        cells = np.array(at_rest(mesh.GetTetVertexIndicesAttr()) or [], np.int32).reshape(-1, 4)
+        points, mirrored = _world_points(mesh)
+    _check_indices(f"{path}, {mesh.GetPath()}", cells.reshape(-1), len(points))
+    return points, cells[:, [0, 2, 1, 3]] if mirrored else cells
+
+
+def surface_mesh(path: str) -> tuple[np.ndarray, np.ndarray]:
+    """What :func:`read_surface_mesh` returns; called in a child process."""
     stage = open_stage(path, MeshError)
     with reporting(f"{path} cannot be read as USD", MeshError):
         meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse(Usd.TraverseInstanceProxies())]
@@ -101,7 +112,10 @@ def _world_points(prim: UsdGeom.PointBased) -> tuple[np.ndarray, bool]:
     matrix = world_matrix(prim.GetPrim())
     left_handed = at_rest(prim.GetOrientationAttr()) == UsdGeom.Tokens.leftHanded
     mirrored = left_handed != (np.linalg.det(matrix[:3, :3]) < 0.0)
-    return points @ matrix[:3, :3] + matrix[3, :3], mirrored
+    points = points @ matrix[:3, :3] + matrix[3, :3]
+    if not np.isfinite(points).all():
+        raise MeshError(f"{prim.GetPath()}: there are points that are not finite")
+    return points, mirrored
 
 
 def _check_indices(where: str, indices: np.ndarray, point_count: int) -> None:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
-from warpfem.errors import WarpfemError
+from warpfem.child import existing
+from warpfem.errors import WarpfemError, one_line
+
+Stamp: TypeAlias = tuple[int, int, int]
+
+_trusted: dict[str, dict[str, Stamp | None]] = {}
+"""What was known of a file, and of the files that it refers to, when it was last read through or written."""
 
 
 @contextlib.contextmanager
@@ -21,8 +28,8 @@ def reporting(what: str, error: type[WarpfemError]) -> Iterator[None]:
     except WarpfemError:
         raise
     except Tf.ErrorException as problem:
-        reasons = [item.commentary.strip() for item in problem.args]
-        raise error(f"{what}: {'; '.join(reasons)}") from problem
+        reasons = "; ".join(item.commentary.strip() for item in problem.args)
+        raise error(f"{what}: {one_line(reasons)}") from problem
     except OSError as problem:
         raise error(f"{what}: {problem}") from problem
 
@@ -30,17 +37,37 @@ def reporting(what: str, error: type[WarpfemError]) -> Iterator[None]:
 def open_stage(path: str | Path, error: type[WarpfemError]) -> Usd.Stage:
     """Opens a USD file as it is on disk now, even if an older state of it is open elsewhere in the process.
 
+    A damaged file may end the process: open what others made in a child process first.
+
     Raises:
         error: the file is missing, or not readable as USD.
     """
-    if not Path(path).is_file():
-        raise error(f"{path}: there is no such file")
+    existing(path, error)
     with reporting(f"{path} cannot be read as USD", error):
         layer = Sdf.Layer.FindOrOpen(str(path))
         layer.Reload()
         stage = Usd.Stage.Open(layer)
         stage.Reload()
     return stage
+
+
+def trust(path: str | Path, layers: Iterable[str] = ()) -> None:
+    """Notes that a file is sound as it is now, with the other ``layers`` that it refers to."""
+    _trusted[os.path.abspath(path)] = {file: _stamp(file) for file in map(os.path.abspath, (path, *layers))}
+
+
+def is_trusted(path: str | Path) -> bool:
+    """Whether nothing has changed since :func:`trust`."""
+    files = _trusted.get(os.path.abspath(path))
+    return files is not None and all(stamp and _stamp(file) == stamp for file, stamp in files.items())
+
+
+def _stamp(path: str) -> Stamp | None:
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns, status.st_ino
 
 
 def at_rest(attribute: Usd.Attribute) -> Any:

@@ -23,7 +23,7 @@ from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.obstacles import define_obstacles
 from warpfem.usd.prims import POINT_PRIMVARS, BodyPrims, define_world, prim_names
 from warpfem.usd.saved import Chunk, partial_path, saved_chunks
-from warpfem.usd.stages import reporting
+from warpfem.usd.stages import reporting, trust
 
 SUFFIXES = (".usdc", ".usd", ".usda")
 
@@ -151,6 +151,7 @@ class UsdWriter:
         if not self._closed:
             with self._saving():
                 self._layer.merge(self._metadata(), self._colors)
+            trust(self.path)
             self._closed = True
         return self.path
 
