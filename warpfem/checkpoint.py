@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, is_dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ import warp as wp
 
 from warpfem import __version__
 from warpfem.boundary import Load, PointForce, PrescribedMotion, Support
-from warpfem.errors import OutputError, source_of, user_code
+from warpfem.errors import OutputError, SceneError, source_of, user_code
 from warpfem.files import beside, save_arrays
 from warpfem.materials import EnergyMaterial, Material
-from warpfem.scene import Body
+from warpfem.mesh import Mesh
+from warpfem.scene import Body, Scene
 from warpfem.simulation import Simulation
 
 _FORMAT = 1
@@ -40,6 +41,8 @@ class Checkpoint:
         displacement, velocity: (point_count, dim) [m] and [m/s], in the precision of the run.
         summary: the summary at that frame, as :meth:`Summary.totals` gives it.
         parts: a digest of each part of the scene that determines the run, by its name.
+        meshes: the mesh of each body.
+        recipe: what the scene was made by, or "".
     """
 
     frame: int
@@ -48,9 +51,11 @@ class Checkpoint:
     velocity: np.ndarray
     summary: Mapping[str, Any]
     parts: Mapping[str, str]
+    meshes: Sequence[Mesh]
+    recipe: str
 
     @classmethod
-    def of(cls, simulation: Simulation, frame: int, parts: Mapping[str, str]) -> Checkpoint:
+    def of(cls, simulation: Simulation, frame: int, parts: Mapping[str, str], recipe: str) -> Checkpoint:
         """That of a simulation which has just come to ``frame``, whose :func:`scene_parts` are given."""
         state = simulation.state
         return cls(
@@ -60,6 +65,8 @@ class Checkpoint:
             state.v.numpy().copy(),
             simulation.summary.totals(),
             {**parts, **_motion_parts(simulation, state.time)},
+            [body.mesh for body in simulation.scene.bodies],
+            recipe,
         )
 
     @classmethod
@@ -73,8 +80,10 @@ class Checkpoint:
             with np.load(path, allow_pickle=False) as arrays:
                 header = json.loads(str(arrays["header"]))
                 if header["format"] == _FORMAT:
-                    fields = {name: header[name] for name in ("frame", "time", "summary", "parts")}
-                    return cls(displacement=arrays["displacement"], velocity=arrays["velocity"], **fields)
+                    fields = {name: header[name] for name in ("frame", "time", "summary", "parts", "recipe")}
+                    fields |= {name: arrays[name] for name in ("displacement", "velocity")}
+                    sets = header["sets"]
+                    return cls(meshes=[_mesh(arrays, index, own) for index, own in enumerate(sets)], **fields)
         except FileNotFoundError:
             raise OutputError(
                 f"there is no checkpoint {path} to resume from: a run writes it with --checkpoint-every N"
@@ -95,7 +104,14 @@ class Checkpoint:
             "time": self.time,
             "summary": self.summary,
             "parts": self.parts,
+            "recipe": self.recipe,
+            "sets": [[list(mesh.point_sets), list(mesh.cell_sets)] for mesh in self.meshes],
         }
+        meshes: dict[str, np.ndarray] = {}
+        for index, mesh in enumerate(self.meshes):
+            meshes |= {f"points_{index}": mesh.points, f"cells_{index}": mesh.cells}
+            for kind, sets in enumerate((mesh.point_sets, mesh.cell_sets)):
+                meshes |= {f"set_{index}_{kind}_{number}": own for number, own in enumerate(sets.values())}
         try:
             save_arrays(
                 path,
@@ -103,10 +119,26 @@ class Checkpoint:
                     "header": np.array(json.dumps(header, default=lambda number: number.item())),
                     "displacement": self.displacement,
                     "velocity": self.velocity,
+                    **meshes,
                 },
             )
         except OSError as error:
             raise OutputError(f"the checkpoint {path} cannot be written: {error}") from error
+
+    def with_meshes(self, scene: Scene, recipe: str) -> Scene:
+        """The scene with the meshes of this checkpoint, if it was made by the same recipe.
+
+        Some meshes come out different each time that they are made: those of fTetWild do. What a scene says
+        of their points by indices or arrays is not made to fit; :meth:`require_fit` finds that.
+        """
+        names = [f"body '{body.name}': the mesh" for body in scene.bodies]
+        if not recipe or recipe != self.recipe or not all(name in self.parts for name in names):
+            return scene
+        try:
+            bodies = [replace(body, mesh=mesh) for body, mesh in zip(scene.bodies, self.meshes, strict=True)]
+            return replace(scene, bodies=bodies)
+        except SceneError:  # an array per cell
+            return scene
 
     def require_fit(self, simulation: Simulation, parts: Mapping[str, str], path: Path) -> None:
         """Checks that this is a checkpoint of the same run, but perhaps with another number of frames.
@@ -130,6 +162,14 @@ class Checkpoint:
             raise OutputError(
                 f"the checkpoint {path} is of frame {self.frame}, but the run has only {simulation.scene.frames} frames"
             )
+
+
+def _mesh(arrays: Mapping[str, np.ndarray], index: int, names: tuple[list[str], list[str]]) -> Mesh:
+    sets = [
+        {name: arrays[f"set_{index}_{kind}_{number}"] for number, name in enumerate(own)}
+        for kind, own in enumerate(names)
+    ]
+    return Mesh(arrays[f"points_{index}"], arrays[f"cells_{index}"], *sets)
 
 
 def scene_parts(simulation: Simulation) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -214,8 +215,9 @@ def _run(arguments: argparse.Namespace) -> int:
         from warpfem.usd import check_path
     check_interrupt()
     check_path(out)
+    recipe = _recipe(arguments)
     if arguments.resume:
-        Checkpoint.read(checkpoint_path(out))  # said before preparing
+        scene = Checkpoint.read(checkpoint_path(out)).with_meshes(scene, recipe)
     elif not arguments.overwrite:
         _require_consent(out)
     say = not (arguments.quiet or arguments.json)
@@ -226,7 +228,11 @@ def _run(arguments: argparse.Namespace) -> int:
     code = OK
     try:
         recording = warpfem.record(
-            simulation, out, checkpoint_every=arguments.checkpoint_every, resume=arguments.resume
+            simulation,
+            out,
+            checkpoint_every=arguments.checkpoint_every,
+            resume=arguments.resume,
+            recipe=recipe,
         )
         with _held_interrupt() as check_interrupt, closing(recording) as frames:
             for _ in _progress(frames, scene.frames + 1) if say else frames:
@@ -253,6 +259,12 @@ def _run(arguments: argparse.Namespace) -> int:
         if code == OK:
             print(f"wrote {out}")
     return code
+
+
+def _recipe(arguments: argparse.Namespace) -> str:
+    """What makes the scene: the file and the parameters."""
+    contents = hashlib.sha256(arguments.scene.read_bytes()).hexdigest()
+    return " ".join([contents, *arguments.settings])
 
 
 def _require_consent(out: Path) -> None:

@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 
 
 def record(
-    simulation: Simulation, path: str | Path, *, checkpoint_every: int | None = None, resume: bool = False
+    simulation: Simulation,
+    path: str | Path,
+    *,
+    checkpoint_every: int | None = None,
+    resume: bool = False,
+    recipe: str = "",
 ) -> Generator[Frame, None, None]:
     """Runs a simulation and stores each frame in the USD file ``path`` before it is yielded.
 
@@ -37,6 +42,7 @@ def record(
             run has come to its end; ``None`` writes none.
         resume: go on after the checkpoint of an earlier run of the same scene, with the frames that it left.
             The frames after the checkpoint are computed again, and yielded.
+        recipe: what the scene was made by, for :meth:`Checkpoint.with_meshes`.
 
     Raises:
         OutputError: the file cannot be written; there is nothing to resume, or it is of another scene. Said
@@ -75,7 +81,7 @@ def record(
 
         def save_checkpoint(index: int) -> None:
             writer.flush()
-            Checkpoint.of(simulation, index, parts).write(checkpoint_file)
+            Checkpoint.of(simulation, index, parts, recipe).write(checkpoint_file)
 
         with _failure_saved(simulation, failure_file):
             for frame in simulation.frames():

@@ -181,7 +181,8 @@ class ChunkedLayer:
                 "times": Vt.Vec2dArray(times),
             }
             root.GetPrimAtPath(WORLD).SetInfo("clips", {"default": clips})
-        self._export(root, self.path)
+        with replacing(self.path) as temporary:  # exporting would use a temporary file of its own
+            temporary.write_text(root.ExportToString(), encoding="utf-8")
         trust(self.path, map(str, self._folder.glob("*.usdc")))
 
     def _describe(self, layer: Sdf.Layer, metadata: dict[str, Any]) -> None:
