@@ -108,7 +108,7 @@ def test_energy_out_of_nothing_is_a_blow_up():
     state.assign(displacement=fallen, velocity=np.broadcast_to([1.0, -10.0], fallen.shape))
     watch.require_bounded(state, 1e-3)  # what gravity gave
     state.assign(velocity=np.broadcast_to([200.0, -10.0], fallen.shape))
-    with pytest.raises(SimulationError, match=r"blown up: its energy has grown by .* fastest point is 0 of body 'slab'"):
+    with pytest.raises(SimulationError, match=r"its energy has grown by .* fastest point is 0 of body 'slab'"):
         watch.require_bounded(state, 1e-3)
 
 

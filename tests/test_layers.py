@@ -12,7 +12,7 @@ LAYERS = [
     {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child"},
     {"mesh", "points"},
     {"materials"},
-    {"elements", "meshing"},
+    {"elements", "meshing", "folds"},
     {"scene"},
     {"supports", "contact"},
     {"model"},

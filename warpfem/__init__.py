@@ -36,7 +36,7 @@ from warpfem.moduli import ElasticModuli, elastic_moduli
 from warpfem.record import record, run
 from warpfem.scene import Body, Scene
 from warpfem.simulation import Frame, Simulation, Summary
-from warpfem.solvers import SOLVERS, BackwardEuler, SymplecticEuler, VelocityVerlet
+from warpfem.solvers import SOLVERS, BackwardEuler, StaticEquilibrium, SymplecticEuler, VelocityVerlet
 
 __all__ = [
     "MATERIALS",
@@ -69,6 +69,7 @@ __all__ = [
     "StVenantKirchhoff",
     "StableNeoHookean",
     "State",
+    "StaticEquilibrium",
     "Stresses",
     "Summary",
     "SymplecticEuler",

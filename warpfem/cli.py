@@ -11,6 +11,7 @@ import platform
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
@@ -40,7 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns 0, 1 for a failed run or 2 for wrong use."""
     arguments = _parser().parse_args(argv)
     try:
-        return arguments.command(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning  # type: ignore[assignment]
+            return arguments.command(arguments)
     except TimeStepError as error:
         return _fail(error, WRONG_USE)
     except SimulationError as error:
@@ -49,6 +52,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(error, WRONG_USE)
     except KeyboardInterrupt:
         return _fail(SimulationError("interrupted before anything was written"), FAILED)
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    print(f"warpfem: warning: {message}", file=sys.stderr)
 
 
 def _fail(error: Exception, code: int) -> int:

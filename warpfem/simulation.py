@@ -14,6 +14,7 @@ import warp as wp
 
 from warpfem.dtypes import FloatName
 from warpfem.errors import SimulationError, TimeStepError
+from warpfem.folds import folds
 from warpfem.model import Energies, Model
 from warpfem.scene import Scene
 from warpfem.solvers.base import Solver, require_finite, worst_cell
@@ -68,6 +69,8 @@ class Summary:
         first_energies, last_energies: energies of the first and the last frame [J].
         largest_von_mises: over all frames [Pa].
         smallest_jacobian: over all frames.
+        inverted_cells: cells with J <= 0 in the last frame.
+        folds: inner edges (2D: points) in the last frame about which cells turn twice (see ``folds.py``).
         first_penetration: depth inside an obstacle in the first frame [m].
         largest_penetration: over all frames [m].
         newton_iterations, cg_iterations: totals over all steps.
@@ -89,6 +92,8 @@ class Summary:
     last_energies: Energies | None = None
     largest_von_mises: float = 0.0
     smallest_jacobian: float = math.inf
+    inverted_cells: int = 0
+    folds: int = 0
     first_penetration: float = 0.0
     largest_penetration: float = 0.0
     newton_iterations: int = 0
@@ -108,6 +113,7 @@ class Summary:
         self.last_energies = frame.energies
         self.largest_von_mises = max(self.largest_von_mises, float(frame.von_mises.max()))
         self.smallest_jacobian = min(self.smallest_jacobian, float(frame.jacobian.min()))
+        self.inverted_cells = int((frame.jacobian <= 0.0).sum())
         self.largest_penetration = max(self.largest_penetration, frame.penetration)
 
     def totals(self) -> dict[str, Any]:
@@ -220,6 +226,8 @@ class Simulation:
             summary.stepping_seconds += time.perf_counter() - start
             frame = self._observe(index)
             summary.add_frame(frame)
+            if index == self.scene.frames and self._warned:
+                self._warn_of_folds(frame)
             yield frame
 
     def _advance(self, end: float) -> None:
@@ -291,6 +299,23 @@ class Simulation:
             energies=model.energies(state),
             penetration=0.0 if model.contact is None else model.contact.depth(displacement),
         )
+
+    def _warn_of_folds(self, frame: Frame) -> None:
+        """Warns of bodies that had inverted cells and ended with none, but folded into themselves."""
+        rest = self.model.rest_points
+        for body, (own, cells) in zip(self.scene.bodies, body_slices(self.model), strict=True):
+            if body.name not in self._warned or (frame.jacobian[cells] <= 0.0).any():
+                continue
+            folded = folds(body.mesh, (rest + frame.displacement)[own])
+            if len(folded):
+                self.summary.folds += len(folded)
+                where = "edges" if self.scene.dim == 3 else "points"
+                warnings.warn(
+                    f"body '{body.name}' has ended folded into itself: its cells turn twice about {len(folded)} of its "
+                    f"inner {where} (the first: {'-'.join(map(str, folded[0]))}). It rests there, though it is not its "
+                    "rest shape: start without inverted cells, or take shorter steps",
+                    stacklevel=2,
+                )
 
     def _warn_of_inverted_cells(self, jacobian: np.ndarray) -> None:
         """Warns, once for each body: the energies of most materials have other minima than the rest shape there."""

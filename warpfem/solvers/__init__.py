@@ -1,10 +1,20 @@
-"""Time integration."""
+"""Time integration, and static equilibrium."""
 
 from warpfem.solvers.base import Solver, Stepper, StepReport
 from warpfem.solvers.explicit import SymplecticEuler, VelocityVerlet
 from warpfem.solvers.implicit import BackwardEuler
+from warpfem.solvers.static import StaticEquilibrium
 
 SOLVERS: dict[str, type[Solver]] = {solver.name: solver for solver in (SymplecticEuler, VelocityVerlet, BackwardEuler)}
 """The solvers by name."""
 
-__all__ = ["SOLVERS", "BackwardEuler", "Solver", "StepReport", "Stepper", "SymplecticEuler", "VelocityVerlet"]
+__all__ = [
+    "SOLVERS",
+    "BackwardEuler",
+    "Solver",
+    "StaticEquilibrium",
+    "StepReport",
+    "Stepper",
+    "SymplecticEuler",
+    "VelocityVerlet",
+]

@@ -1,0 +1,201 @@
+"""Static equilibrium: the state of least potential under the loads, without inertia."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpfem.errors import SceneError, SimulationError
+from warpfem.folds import folds
+from warpfem.model import Model, State
+from warpfem.scene import Body
+from warpfem.solvers.base import StepReport, worst_cell
+from warpfem.solvers.implicit import BackwardEuler, _BackwardEulerStepper
+
+
+@dataclass(frozen=True)
+class StaticEquilibrium:
+    """Newton's method with line search on the potential energy of elasticity, loads and obstacles.
+
+    Attributes:
+        tolerance: largest accepted norm of the unbalanced force, relative to the largest of internal force, load
+            and contact.
+        max_iterations: Newton iterations.
+    """
+
+    tolerance: float = 1e-5
+    max_iterations: int = 200
+
+    def __post_init__(self) -> None:
+        self._settings  # noqa: B018 - it checks the values
+
+    @functools.cached_property
+    def _settings(self) -> BackwardEuler:
+        return BackwardEuler(tolerance=self.tolerance, max_iterations=max(2, self.max_iterations))
+
+    def solve(self, model: Model, state: State) -> StepReport:
+        """Moves ``state`` to the equilibrium that descent from it leads to, at rest.
+
+        Prescribed motions are held where they are at the state's time.
+
+        Raises:
+            SceneError: a body can move freely: the message names how; or an obstacle has friction, with which the
+                equilibrium depends on the way there.
+            SimulationError: none is found, or one with inverted cells, or with a body folded into itself. The
+                state is then as it was before.
+        """
+        for index, body in enumerate(model.scene.bodies):
+            modes = free_rigid_modes(model, index)
+            if modes:
+                raise SceneError(
+                    f"body '{body.name}' can move freely: {'; '.join(modes)}. A static equilibrium needs pins against "
+                    "that (obstacles do not count)"
+                )
+        if model.contact is not None and model.contact.rough:
+            raise SceneError(
+                "with friction the equilibrium depends on the way there: take friction=0, or BackwardEuler with "
+                "damping until the bodies rest"
+            )
+        stepper = _StaticStepper(model, self._settings)
+        report = stepper.solve(state)
+        u = State(stepper.solution, state.v)
+        jacobian, _ = model.diagnostics(u)
+        if (jacobian <= 0.0).any():
+            raise SimulationError(
+                f"the equilibrium that was found has {int((jacobian <= 0.0).sum())} inverted cells: "
+                f"{worst_cell(model, u.u)}. Start nearer to it, with smaller loads, or take NeoHookean"
+            )
+        _require_unfolded(model, u.displacement)
+        wp.copy(state.u, stepper.solution)
+        state.v.zero_()
+        state.revision += 1
+        return report
+
+
+def _require_unfolded(model: Model, displacement: np.ndarray) -> None:
+    x = model.rest_points + displacement
+    for index, body in enumerate(model.scene.bodies):
+        found = folds(body.mesh, x[model.point_starts[index] : model.point_starts[index + 1]])
+        if len(found):
+            raise SimulationError(
+                f"the equilibrium that was found has body '{body.name}' folded into itself: its cells turn twice about "
+                f"{len(found)} inner places (the first: points {'-'.join(map(str, found[0]))}). Start without inverted "
+                "cells"
+            )
+
+
+class _StaticStepper(_BackwardEulerStepper):
+    """The Newton iteration of backward Euler, with a weight of inertia of 0."""
+
+    def solve(self, state: State) -> StepReport:
+        self._weight, self._dt, self._start = 0.0, 1.0, state.u
+        self._predicted.zero_()
+        if self.model.supports is not None:
+            self.model.supports.advance(state.time, 0.0)
+        report = self._newton(state, state.time)
+        if not (report.converged or report.rounded):
+            raise SimulationError(
+                f"no static equilibrium found: {report.note}, with a residual of {report.residual:.1e}; "
+                f"{worst_cell(self.model, self._u)}. Start nearer to it, or with smaller loads"
+            )
+        return report
+
+    @property
+    def solution(self) -> wp.array:
+        return self._u
+
+    def _choose_start(self, state: State) -> float:
+        wp.copy(self._u, state.u)
+        self._hold(self._u)
+        return self._potential(self._u)
+
+
+def free_rigid_modes(model: Model, index: int) -> list[str]:
+    """The rigid motions of a body, for small angles, that its supports leave free, in words.
+
+    Args:
+        model: the model.
+        index: number of the body in the scene.
+    """
+    body = model.scene.bodies[index]
+    points, held = _held(model, index)
+    dim = model.dim
+    origin = body.mesh.points[points].mean(axis=0) if len(points) else body.mesh.points.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(body.mesh.bounding_box, axis=0)))
+    arms = (body.mesh.points[points] - origin) / size
+    turns = _turns(dim)
+    motions = np.concatenate(
+        [np.broadcast_to(np.eye(dim), (len(points), dim, dim)), np.einsum("rij,pj->pri", turns, arms)], axis=1
+    )
+    rows = motions.transpose(0, 2, 1)[held]
+    free = _null_space(rows, dim + len(turns))
+    return [_in_words(mode, origin, size, body) for mode in free]
+
+
+def _held(model: Model, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """The held points of a body, by their numbers in its mesh, and which of their components (k, dim) bool."""
+    if model.supports is None:
+        return np.empty(0, dtype=np.int64), np.empty((0, model.dim), dtype=bool)
+    points = model.supports.host_points
+    own = (points >= model.point_starts[index]) & (points < model.point_starts[index + 1])
+    return points[own] - model.point_starts[index], model.supports.held.numpy()[own] > 0.0
+
+
+def _turns(dim: int) -> np.ndarray:
+    """The matrices of small turns: one in the plane, three in space."""
+    if dim == 2:
+        return np.array([[[0.0, -1.0], [1.0, 0.0]]])
+    turns = np.zeros((3, 3, 3))
+    for axis in range(3):
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        turns[axis, b, a], turns[axis, a, b] = 1.0, -1.0
+    return turns
+
+
+def _null_space(rows: np.ndarray, count: int) -> np.ndarray:
+    """A basis of what the rows (k, count) leave free, each vector with a 1 where the others have 0."""
+    if len(rows):
+        _, values, Vt = np.linalg.svd(rows, full_matrices=True)
+        rank = int((values > 1e-9 * max(1.0, values[0])).sum())
+        basis = Vt[rank:]
+    else:
+        basis = np.eye(count)
+    lead = 0
+    for row in range(len(basis)):  # reduced echelon form
+        while lead < count and np.abs(basis[row:, lead]).max() < 1e-9:
+            lead += 1
+        pivot = row + int(np.argmax(np.abs(basis[row:, lead])))
+        basis[[row, pivot]] = basis[[pivot, row]]
+        basis[row] /= basis[row, lead]
+        for other in range(len(basis)):
+            if other != row:
+                basis[other] -= basis[other, lead] * basis[row]
+        lead += 1
+    return basis
+
+
+def _in_words(mode: np.ndarray, origin: np.ndarray, size: float, body: Body) -> str:
+    dim = body.mesh.dim
+    shift, turn = mode[:dim], mode[dim:] / size
+    if np.abs(turn).max() * size < 1e-9:
+        return f"translation along {_direction(shift)}"
+    if dim == 2:
+        center = origin + np.array([-shift[1], shift[0]]) / turn[0]
+        return f"rotation about {_place(center)}"
+    center = origin + np.cross(turn, shift) / (turn @ turn)
+    pitch = abs(turn @ shift) / np.linalg.norm(turn)
+    kind = "rotation" if pitch < 1e-9 else "screw motion"
+    return f"{kind} about {_direction(turn)} through {_place(center)}"
+
+
+def _direction(vector: np.ndarray) -> str:
+    unit = vector / np.abs(vector).max()
+    axis = int(np.argmax(np.abs(unit)))
+    if np.abs(np.delete(unit, axis)).max() < 1e-9:
+        return "xyz"[axis]
+    return _place(unit)
+
+
+def _place(point: np.ndarray) -> str:
+    return f"({', '.join(f'{c:.3g}' for c in np.round(point, 9) + 0.0)})"
