@@ -44,7 +44,8 @@ E, NU = 1e5, 0.3
     "After a rigid rotation by 0 to 360 degrees the largest force at a point is below 4 eps E A L/h: eps the "
     "precision, A the cross-section, L the body's length, h its shortest edge. A translation by T = 1e6 L gives no "
     "force at all, and changes the forces of a deformed body by at most 4 eps E A |T|/h, which is what the "
-    "displacement resolves. (Linear elasticity is not invariant under rotations: translation only.)",
+    "displacement resolves. All at nu = 0.3: what one rounding of the displacement makes grows with lambda/E. (Linear "
+    "elasticity is not invariant under rotations: translation only.)",
 )
 def rigid_motion(quick: bool) -> Iterator[Trial]:
     rng = np.random.default_rng(1)
