@@ -214,6 +214,19 @@ def test_default_stiffness_is_the_p_wave_modulus_over_the_edge_length(dim):
     assert contact_force(model, state)[:, 1].sum() == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_default_stiffness_stops_a_thrown_body_within_a_quarter_of_its_thickness(dim):
+    thrown = brick(dim, stiffness_of_body=1e5, velocity=(0.0, -100.0, 0.0)[:dim])
+    model, state, stepper = ready(Scene([thrown], BackwardEuler(), obstacles=[plane(dim)]))
+    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.01, 0.0][:dim]))
+    expected = 0.01 * 1000.0 * 100.0**2 / (0.25**2 * 0.125)  # force on the base of area 1: k depth
+    assert contact_force(model, state)[:, 1].sum() == pytest.approx(expected, rel=1e-12)
+    state.assign(displacement=np.zeros((model.point_count, dim)))
+    depths = []
+    advance(stepper, state, 1e-4, 20, lambda: depths.append(model.contact.depth(state.displacement)))
+    assert 0.0 < max(depths) < 0.25 * 0.125
+
+
 @pytest.mark.parametrize("solver", FAMILIES, ids=solver_name)
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", ["sphere", "walls"])

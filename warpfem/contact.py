@@ -22,6 +22,9 @@ from warpfem.dtypes import types
 from warpfem.mesh import Mesh
 from warpfem.scene import Body
 
+STOPPING_DEPTH = 0.25
+"""Part of a body's thickness within which the default stiffness stops it from the speed that it starts with."""
+
 
 @functools.cache
 def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
@@ -259,10 +262,14 @@ class _ObstacleContact:
             axis, radius = obstacle.normal, 0.0
             n = np.array(axis)
             origin = np.outer((surface.rest - np.array(obstacle.point)) @ n, n)  # the rest would cost digits
+            outward = n
         else:
             axis, radius = (0.0,) * dim, obstacle.radius
             origin = surface.rest - np.array(obstacle.center)
-        pressure_rate = surface.stiffness if obstacle.stiffness is None else obstacle.stiffness
+            outward = origin / np.maximum(np.linalg.norm(origin, axis=1, keepdims=True), obstacle.radius)
+        approach = np.maximum(-(surface.velocity * outward).sum(axis=1), 0.0)
+        default = np.maximum(surface.stiffness, surface.stopping * approach**2)
+        pressure_rate = default if obstacle.stiffness is None else obstacle.stiffness
         self.shape = [t.vector(*axis), t.scalar(radius)]
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
         self.host_stiffness = pressure_rate * surface.areas  # N/m
@@ -298,22 +305,33 @@ def _bearing_areas(mesh: Mesh) -> np.ndarray:
 
 
 class ContactSurface:
-    """The boundary points of all bodies with their rest places, areas and default stiffness."""
+    """The boundary points of all bodies with their rest places, areas, initial velocities and default stiffness.
+
+    ``stopping`` times the square of the speed at which a body approaches an obstacle is the stiffness [Pa/m] that
+    stops it within ``STOPPING_DEPTH``: per area, k d^2 / 2 = rho L v^2 / 2 for a body of thickness L that hits with
+    all its mass.
+    """
 
     def __init__(self, bodies: Sequence[Body], starts: Sequence[int], p_wave: Sequence[float], device) -> None:
-        rest, points, areas, stiffness = [], [], [], []
+        rest, points, areas, stiffness, velocity, stopping = [], [], [], [], [], []
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
             mesh = body.mesh
             rest.append(mesh.points[mesh.boundary_points])
             points.append(start + mesh.boundary_points)
             areas.append(_bearing_areas(mesh))
             stiffness.append(np.full(len(mesh.boundary_points), modulus / mesh.mean_edge_length))
+            velocity.append(body.initial_velocity()[mesh.boundary_points])
+            thickness = float(np.ptp(mesh.bounding_box, axis=0).min())
+            inertia = np.max(body.density) / (STOPPING_DEPTH**2 * thickness)
+            stopping.append(np.full(len(mesh.boundary_points), inertia))
         self.device = device
         self.rest = np.concatenate(rest)
         self.host_points = np.concatenate(points)
         self.points = wp.array(self.host_points, dtype=wp.int32, device=device)
         self.areas = np.concatenate(areas)
         self.stiffness = np.concatenate(stiffness)
+        self.velocity = np.concatenate(velocity)
+        self.stopping = np.concatenate(stopping)
 
 
 class Contact:
