@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from pxr import Sdf
 
 import warpfem as wf
@@ -444,7 +445,7 @@ def test_the_failing_state_keeps_numbers_that_are_not_finite_and_the_attempt(tmp
         broken = state.displacement
         broken[3] = np.nan
         state.u.assign(broken.astype(np.float32))
-        simulation.stepper.attempt = np.full_like(broken, np.inf)
+        simulation.stepper.attempt = wp.full(len(broken), np.inf, dtype=wp.vec2f)
         raise wf.SimulationError("it broke")
 
     with pytest.raises(wf.SimulationError), closing(wf.record(simulation, tmp_path / "run.usdc")) as frames:

@@ -40,7 +40,7 @@ def save_failure(path: Path, simulation: Simulation, error: Exception) -> None:
     }
     for index, (body, (points, _)) in enumerate(zip(model.scene.bodies, body_slices(model), strict=True)):
         arrays[f"cells_{index}"] = points.start + body.mesh.cells
-    attempt = getattr(simulation.stepper, "attempt", None)
+    attempt = simulation.stepper.attempt
     if attempt is not None:
-        arrays["attempted_displacement"] = np.asarray(attempt, dtype=np.float64)
+        arrays["attempted_displacement"] = attempt.numpy().astype(np.float64)
     save_arrays(path, arrays)
