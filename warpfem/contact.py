@@ -132,6 +132,30 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         if gap < scalar(0.0):
             blocks_out[i] += stiffness[k] * wp.outer(normal, normal)
 
+    @wp.kernel(module=module, enable_backward=False)
+    def core_limit(
+        points: wp.array(dtype=wp.int32),
+        origin: wp.array(dtype=vector),
+        radius: scalar,
+        u: wp.array(dtype=vector),
+        p: wp.array(dtype=vector),
+        limit_out: wp.array(dtype=scalar),
+    ):
+        """Lowers ``limit_out[0]`` to the least s > 0 at which u + s p takes a point outside of the core into it.
+
+        The core is the sphere of half the radius.
+        """
+        k = wp.tid()
+        i = points[k]
+        y = origin[k] + u[i]
+        core = scalar(0.5) * radius
+        # |y + s p|^2 = core^2 at s = c / (b + sqrt(b^2 - a c)), b = -y . p > 0
+        b = -wp.dot(y, p[i])
+        c = wp.dot(y, y) - core * core
+        discriminant = b * b - wp.dot(p[i], p[i]) * c
+        if c > scalar(0.0) and b > scalar(0.0) and discriminant > scalar(0.0):
+            wp.atomic_min(limit_out, 0, c / (b + wp.sqrt(discriminant)))
+
     @wp.func
     def slip_of(u: vector, u_start: vector, normal: vector):
         s = u - u_start
@@ -239,6 +263,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         contact_energy=contact_energy,
         contact_force=contact_force,
         contact_blocks=contact_blocks,
+        core_limit=core_limit,
         friction_energy=friction_energy,
         friction_force=friction_force,
         friction_blocks=friction_blocks,
@@ -354,6 +379,14 @@ class Contact:
             # once for the walls of a box: those that a point can touch together are perpendicular
             self._host_stiffness += self.parts[-1].host_stiffness
         self._rough = [part for part in self.parts if part.friction > 0.0]
+        self._balls = [
+            part for part, obstacle in zip(self.parts, self._obstacles, strict=True) if isinstance(obstacle, Sphere)
+        ]
+
+    @property
+    def limits_steps(self) -> bool:
+        """Whether there is an obstacle that a point could cross in one step and leave on the other side."""
+        return bool(self._balls)
 
     @property
     def rough(self) -> bool:
@@ -394,6 +427,11 @@ class Contact:
         """Adds each point's normal stiffness to its d x d block."""
         for part in self.parts:
             part.launch("contact_blocks", [*part.normal_arguments, u], [blocks_out])
+
+    def limit_step(self, u: wp.array, p: wp.array, limit_out: wp.array) -> None:
+        """Lowers ``limit_out[0]`` so far that u + s p takes no point into the core of a sphere."""
+        for part in self._balls:
+            part.launch("core_limit", [part.points, part.origin, part.shape[1], u, p], [limit_out])
 
     # Friction of one step: its limits are those at one u, then come the potential's terms at any trial u.
 

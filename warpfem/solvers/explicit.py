@@ -66,16 +66,15 @@ class _ExplicitStepper(Stepper):
         return [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]
 
     def stable_dt(self, state: State | None = None) -> float:
-        limit = 2.0 / largest_frequency(self.model)
-        if state is None:
-            return limit
-        here = 2.0 / largest_frequency(self.model, state.u)
-        if not np.isfinite(here):
+        frequency = largest_frequency(self.model)
+        if state is not None:
+            frequency = np.maximum(frequency, largest_frequency(self.model, state.u))  # not a number stays
+        if state is not None and not np.isfinite(frequency):
             raise SimulationError(
                 f"t = {state.time:.6g} s: the stiffness of the state is not finite; "
                 f"{worst_cell(self.model, state.u)}. Start from a state with J > 0, or take StableNeoHookean"
             )
-        return min(limit, here)
+        return 2.0 / frequency if frequency > 0.0 else np.inf
 
     def estimate_stable_dt(self, state: State) -> float:
         if self._watch is None:

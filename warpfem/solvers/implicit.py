@@ -54,26 +54,26 @@ def _implicit_kernels(dim: int, dtype: str) -> SimpleNamespace:
         load: wp.array(dtype=vector),
         inverse_mass: wp.array(dtype=scalar),
         inverse_weight: scalar,
-        u_out: wp.array(dtype=vector),
+        increment_out: wp.array(dtype=vector),
     ):
-        """Writes where dead loads alone would take the points."""
+        """Writes how far dead loads alone would take the points."""
         i = wp.tid()
-        u_out[i] = predicted[i] + (inverse_weight * inverse_mass[i]) * load[i]
+        increment_out[i] = predicted[i] + (inverse_weight * inverse_mass[i]) * load[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def inertia_energy(
         mass: wp.array(dtype=scalar),
         weight: scalar,
         predicted: wp.array(dtype=vector),
-        u: wp.array(dtype=vector),
+        increment: wp.array(dtype=vector),
         energy_out: wp.array(dtype=wp.float64),
     ):
-        """Adds weight/2 |u - predicted|^2_M."""
+        """Adds weight/2 |increment - predicted|^2_M."""
         first = wp.tid() * CHUNK
-        last = wp.min(first + CHUNK, u.shape[0])
+        last = wp.min(first + CHUNK, increment.shape[0])
         total = wp.float64(0.0)
         for i in range(first, last):
-            d = u[i] - predicted[i]
+            d = increment[i] - predicted[i]
             square = wp.float64(0.0)
             for k in range(dim):
                 square += wp.float64(d[k]) * wp.float64(d[k])
@@ -85,29 +85,46 @@ def _implicit_kernels(dim: int, dtype: str) -> SimpleNamespace:
         mass: wp.array(dtype=scalar),
         weight: scalar,
         predicted: wp.array(dtype=vector),
-        u: wp.array(dtype=vector),
+        increment: wp.array(dtype=vector),
         force_out: wp.array(dtype=vector),
     ):
-        """Writes -weight M (u - predicted)."""
+        """Writes -weight M (increment - predicted)."""
         i = wp.tid()
-        force_out[i] = (weight * mass[i]) * (predicted[i] - u[i])
+        force_out[i] = (weight * mass[i]) * (predicted[i] - increment[i])
 
     @wp.kernel(module=module, enable_backward=False)
     def rounding(
         inverse_diagonal: wp.array(dtype=matrix),
+        mass: wp.array(dtype=scalar),
+        weight: scalar,
         epsilon: scalar,
         u: wp.array(dtype=vector),
+        increment: wp.array(dtype=vector),
         force_out: wp.array(dtype=vector),
+        work_out: wp.array(dtype=wp.float64),
     ):
-        """Writes the change of force that one rounding of u makes: epsilon |A_ii| |u_i|."""
+        """Writes the change of force that one rounding of u and of the increment makes, and sums its work.
+
+        It is epsilon (|K_ii| |u_i| + weight m_i |d_i|) with the blocks K_ii + weight m_i I on the diagonal.
+        """
         i = wp.tid()
+        inertia = weight * mass[i]
         scale = wp.trace(inverse_diagonal[i])
         block = wp.inverse(inverse_diagonal[i] / scale) / scale
         force = vector()
+        work = scalar(0.0)
         for k in range(dim):
+            elastic = scalar(0.0)
             for j in range(dim):
-                force[k] += wp.abs(block[k, j] * u[i][j])
-        force_out[i] = epsilon * force
+                entry = block[k, j]
+                if j == k:
+                    entry -= inertia
+                elastic += wp.abs(entry * u[i][j])
+            moved = wp.abs(increment[i][k])
+            force[k] = epsilon * (elastic + inertia * moved)
+            work += epsilon * (elastic * wp.abs(u[i][k]) + inertia * moved * moved)
+        force_out[i] = force
+        wp.atomic_add(work_out, 0, wp.float64(work))
 
     return SimpleNamespace(
         add_scaled=add_scaled,
@@ -119,11 +136,12 @@ def _implicit_kernels(dim: int, dtype: str) -> SimpleNamespace:
 
 
 class _BackwardEulerStepper(Stepper):
-    """The unknown is the displacement u at the end of the step; the incremental potential is
+    """The unknown is the increment d = u - u_t of the displacement; the incremental potential is
 
-    Phi(u) = w/2 |u - u~|^2_M + U(u) - f_dead . u + contact(u) + friction(u),
+    Phi(d) = w/2 |d - d~|^2_M + U(u) - f_dead . u + contact(u) + friction(u),  u = u_t + d,
 
-    with w = (1 + alpha dt) / dt^2 and u~ = u_t + dt v_t / (1 + alpha dt), alpha the damping.
+    with w = (1 + alpha dt) / dt^2 and d~ = dt v_t / (1 + alpha dt), alpha the damping. Inertia and velocity come
+    from d itself: the difference of two displacements would lose it in short steps.
     """
 
     def __init__(self, model: Model, config: "BackwardEuler") -> None:
@@ -132,15 +150,16 @@ class _BackwardEulerStepper(Stepper):
         self.kernels = _implicit_kernels(model.dim, model.dtype)
         self.operator = tangent_operator(model, config.differential)
         self.cg = ConjugateGradients(model)
-        self._u, self._trial, self._predicted, self._force, self._part, self._direction = (
-            model.zeros() for _ in range(6)
-        )
+        self._u, self._trial, self._d, self._trial_d = (model.zeros() for _ in range(4))
+        self._predicted, self._force, self._part, self._direction = (model.zeros() for _ in range(4))
         self._sum = wp.zeros(1, dtype=wp.float64, device=model.device)
         self._barriers = [block for block in model.blocks if block.kernels.constitutive.barrier]
-        self._limit = wp.zeros(1, dtype=model.types.scalar, device=model.device) if self._barriers else None
+        limited = self._barriers or (model.contact is not None and model.contact.limits_steps)
+        self._limit = wp.zeros(1, dtype=model.types.scalar, device=model.device) if limited else None
 
     def arrays(self) -> list[wp.array]:
-        own = [self._u, self._trial, self._predicted, self._force, self._part, self._direction, self._sum]
+        own = [self._u, self._trial, self._d, self._trial_d, self._predicted]
+        own += [self._force, self._part, self._direction, self._sum]
         if self._limit is not None:
             own.append(self._limit)
         return [*own, *self.cg.arrays(), *self.operator.arrays()]
@@ -193,7 +212,8 @@ class _BackwardEulerStepper(Stepper):
         damping = model.scene.damping
         self._weight = (1.0 + damping * dt) / dt**2
         self._start, self._dt = state.u, dt
-        self._launch("add_scaled", [state.u, dt / (1.0 + damping * dt), state.v], [self._predicted])
+        self._predicted.zero_()
+        self._launch("add_scaled", [self._predicted, dt / (1.0 + damping * dt), state.v], [self._predicted])
         if model.supports is not None:
             model.supports.advance(time, dt)
         if model.contact is not None:
@@ -203,10 +223,8 @@ class _BackwardEulerStepper(Stepper):
             raise SimulationError(
                 f"{report.note}, with a residual of {report.residual:.1e}; {worst_cell(model, self._u)}"
             )
-        # v = (u - u_t) / dt, then u
-        self._launch("add_scaled", [self._u, -1.0, state.u], [self._part])
         state.v.zero_()
-        self._launch("add_scaled", [state.v, 1.0 / dt, self._part], [state.v])
+        self._launch("add_scaled", [state.v, 1.0 / dt, self._d], [state.v])
         wp.copy(state.u, self._u)
         if model.supports is not None:
             model.supports.hold(state.u, state.v)
@@ -222,24 +240,38 @@ class _BackwardEulerStepper(Stepper):
             self.model.supports.project(self._force)
         self._linearize("exact")
         self.cg.solve(self.operator, self._force, self._direction, tolerance=0.5, max_iterations=1)
-        self._rounding_force(self._u)
+        self._rounding()
 
     # --- one linear system: the lecture's step ----------------------------------------------------------
 
     def _linearised(self, state: State, time: float) -> StepReport:
         if self.model.contact is not None:
-            self.model.contact.linearize_friction(state.u, self._dt, self._predicted)
-        wp.copy(self._u, state.u)
-        self._hold(self._u)
-        self._unbalanced_force(self._u)
+            self._launch("add_scaled", [state.u, 1.0, self._predicted], [self._part])
+            self.model.contact.linearize_friction(state.u, self._dt, self._part)
+        self._d.zero_()
+        self._move(self._d, self._u)
+        self._unbalanced_force(self._d, self._u)
         require_finite(self.model, self._force, "the force", time)
         self._linearize(self.config.hessian)
         result = self._solve(self.config.linear_tolerance)
-        self._launch("add_scaled", [self._u, 1.0, self._direction], [self._u])
+        self._launch("add_scaled", [self._d, 1.0, self._direction], [self._d])
+        self._move(self._d, self._u)
         require_finite(self.model, self._u, "the displacement", time)
+        residual = self._true_residual()
         converged = result.status is LinearStatus.CONVERGED
+        if converged and residual > 10.0 * self.config.linear_tolerance:
+            converged = residual <= ROUNDING_LIMIT
+            note = f"resolved only to the rounding of {self.model.dtype}"
+            return StepReport(1, result.iterations, residual, converged, rounded=True, note=note)
         note = "" if converged else f"conjugate gradients {result.status.value}"
-        return StepReport(1, result.iterations, result.residual, converged, note=note)
+        return StepReport(1, result.iterations, residual, converged, note=note)
+
+    def _true_residual(self) -> float:
+        """|b - A x| / |b| of the linear system: the one that conjugate gradients keep drifts away by rounding."""
+        size = self.model.dot(self._force, self._force) ** 0.5
+        self.operator.apply(self._direction, self._part)
+        self._launch("add_scaled", [self._force, -1.0, self._part], [self._part])
+        return self.model.dot(self._part, self._part) ** 0.5 / size if size > 0.0 else 0.0
 
     # --- Newton's method --------------------------------------------------------------------------------
 
@@ -259,8 +291,8 @@ class _BackwardEulerStepper(Stepper):
         for iteration in range(config.max_iterations + 1):
             if rough and 0 < iteration <= FRICTION_UPDATES:
                 model.contact.limit_friction(self._u)
-                potential = self._potential(self._u)
-            residual, scale = self._unbalanced_force(self._u)
+                potential = self._potential(self._d, self._u)
+            residual, scale = self._unbalanced_force(self._d, self._u)
             if not np.isfinite(residual):
                 require_finite(model, self._force, "the force", time)
             relative = residual / scale if scale > 0.0 else 0.0
@@ -269,9 +301,9 @@ class _BackwardEulerStepper(Stepper):
             if iteration == config.max_iterations:
                 break
             self._linearize("exact")
-            rounding = self._rounding_force(self._u)
+            rounding, noise = self._rounding()
             if residual <= rounding:
-                return self._rounded(solves, cg_iterations, relative)
+                return self._rounded(solves, cg_iterations, relative, scale <= 4.0 * rounding)
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             result = self._solve(forcing)
             solves += 1
@@ -282,42 +314,48 @@ class _BackwardEulerStepper(Stepper):
                 solves += 1
                 cg_iterations += result.iterations
             if not config.line_search:
-                self._launch("add_scaled", [self._u, 1.0, self._direction], [self._u])
+                self._launch("add_scaled", [self._d, 1.0, self._direction], [self._d])
+                self._move(self._d, self._u)
                 continue
             slope = -model.dot(self._force, self._direction)
-            noise = 16.0 * model.types.epsilon * abs(potential) + rounding * model.dot(self._u, self._u) ** 0.5
+            noise += 16.0 * model.types.epsilon * abs(potential)
             found = self._line_search(potential, slope, noise)
             if found is None:
                 if -slope <= noise:
-                    return self._rounded(solves, cg_iterations, relative)
+                    return self._rounded(solves, cg_iterations, relative, scale <= 4.0 * rounding)
                 note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
                 break
             potential = found
         return StepReport(solves, cg_iterations, relative, False, note=note)
 
-    def _rounded(self, solves: int, cg_iterations: int, relative: float) -> StepReport:
-        note = f"resolved only to the rounding of {self.model.dtype}"
-        return StepReport(solves, cg_iterations, relative, relative <= ROUNDING_LIMIT, rounded=True, note=note)
+    def _rounded(self, solves: int, cg_iterations: int, relative: float, all_is_noise: bool) -> StepReport:
+        """The end of a step of which rounding hides the rest: good if that is little, or if no force acts at all."""
+        model = self.model
+        at_rest = all_is_noise and model.dead_load is None and model.contact_energy(self._u) == 0.0
+        note = f"resolved only to the rounding of {model.dtype}"
+        converged = at_rest or relative <= ROUNDING_LIMIT
+        return StepReport(solves, cg_iterations, relative, converged, rounded=True, note=note)
 
     def _choose_start(self, state: State) -> float:
-        """Starts from the old state or from free flight, whichever has less potential."""
-        self._prepare_flight(self._trial)
-        self._hold(self._trial)
-        wp.copy(self._u, state.u)
-        self._hold(self._u)
-        still, flying = self._potential(self._u), self._potential(self._trial)
-        if flying < still or not np.isfinite(still):
+        """Starts from the old state or from free flight, whichever has less potential and can be reached."""
+        model = self.model
+        self._d.zero_()
+        if model.dead_load is None:
+            wp.copy(self._trial_d, self._predicted)
+        else:
+            arguments = [self._predicted, model.dead_load, model.inverse_mass, 1.0 / self._weight]
+            self._launch("free_flight", arguments, [self._trial_d])
+        if model.supports is not None:
+            model.supports.project(self._trial_d)
+        self._move(self._d, self._u)
+        self._move(self._trial_d, self._trial)
+        still = self._potential(self._d, self._u)
+        flying = self._potential(self._trial_d, self._trial)
+        if (flying < still or not np.isfinite(still)) and self._longest_step(self._trial_d, contact_only=True) >= 1.0:
+            wp.copy(self._d, self._trial_d)
             wp.copy(self._u, self._trial)
             return flying
         return still
-
-    def _prepare_flight(self, u_out: wp.array) -> None:
-        model = self.model
-        if model.dead_load is None:
-            wp.copy(u_out, self._predicted)
-        else:
-            arguments = [self._predicted, model.dead_load, model.inverse_mass, 1.0 / self._weight]
-            self._launch("free_flight", arguments, [u_out])
 
     def _line_search(self, potential: float, slope: float, noise: float) -> float | None:
         """Backtracks from the full step until the potential falls enough (Armijo); None if it never does.
@@ -328,28 +366,36 @@ class _BackwardEulerStepper(Stepper):
         overshoots by half.
         """
         model = self.model
-        length = full = self._longest_step()
+        length = full = self._longest_step(self._direction)
         for _ in range(40):
-            self._launch("add_scaled", [self._u, length, self._direction], [self._trial])
-            value = self._potential(self._trial)
+            self._launch("add_scaled", [self._d, length, self._direction], [self._trial_d])
+            self._move(self._trial_d, self._trial)
+            value = self._potential(self._trial_d, self._trial)
             fell = value <= potential + 1e-4 * length * slope
             if not fell and value <= potential + noise:
-                self._unbalanced_force(self._trial)
+                self._unbalanced_force(self._trial_d, self._trial)
                 fell = -model.dot(self._force, self._direction) <= (-0.5 * slope if length == full else 0.0)
             if fell:
                 self._u, self._trial = self._trial, self._u
+                self._d, self._trial_d = self._trial_d, self._d
                 return value
             length *= 0.5
         return None
 
-    def _longest_step(self) -> float:
-        """1, or nine tenths of what takes the first cell that does not bear inversion to J = 0."""
+    def _longest_step(self, direction: wp.array, contact_only: bool = False) -> float:
+        """1, or nine tenths of what takes the first cell that does not bear inversion to J = 0.
+
+        Nor may a point cross an obstacle that it could leave on the other side.
+        """
         if self._limit is None:
             return 1.0
         self._limit.fill_(1.0 / 0.9)
-        for block in self._barriers:
-            block.launch("step_limit", [self._u, self._direction], [self._limit])
-        return 0.9 * float(self._limit.numpy()[0])
+        if not contact_only:
+            for block in self._barriers:
+                block.launch("step_limit", [self._u, direction], [self._limit])
+        if self.model.contact is not None:
+            self.model.contact.limit_step(self._u, direction, self._limit)
+        return min(1.0, 0.9 * float(self._limit.numpy()[0]))
 
     # --- terms ------------------------------------------------------------------------------------------
 
@@ -361,14 +407,19 @@ class _BackwardEulerStepper(Stepper):
         if self.model.supports is not None:
             self.model.supports.hold(u, self._part)  # the rates go to a work array
 
-    def _potential(self, u: wp.array) -> float:
-        """Phi(u)."""
+    def _move(self, d: wp.array, u_out: wp.array) -> None:
+        """Writes u = u_t + d, with held components at their targets."""
+        self._launch("add_scaled", [self._start, 1.0, d], [u_out])
+        self._hold(u_out)
+
+    def _potential(self, d: wp.array, u: wp.array) -> float:
+        """Phi of the increment d, which leads to u."""
         model, total = self.model, self._sum
         total.zero_()
         wp.launch(
             self.kernels.inertia_energy,
             chunks(model.point_count),
-            inputs=[model.mass, self._weight, self._predicted, u],
+            inputs=[model.mass, self._weight, self._predicted, d],
             outputs=[total],
             device=model.device,
         )
@@ -380,10 +431,10 @@ class _BackwardEulerStepper(Stepper):
         load = 0.0 if model.dead_load is None else model.dot(model.dead_load, u)
         return float(total.numpy()[0]) - load
 
-    def _unbalanced_force(self, u: wp.array) -> tuple[float, float]:
-        """Writes -dPhi/du to ``_force``, zero where held; returns its norm and that of the largest part."""
+    def _unbalanced_force(self, d: wp.array, u: wp.array) -> tuple[float, float]:
+        """Writes -dPhi/dd to ``_force``, zero where held; returns its norm and that of the largest part."""
         model, force, part = self.model, self._force, self._part
-        self._launch("inertia_force", [model.mass, self._weight, self._predicted, u], [force])
+        self._launch("inertia_force", [model.mass, self._weight, self._predicted, d], [force])
         sizes = [model.dot(force, force)]
         part.zero_()
         model.add_internal_force(u, part)
@@ -415,13 +466,15 @@ class _BackwardEulerStepper(Stepper):
             max_iterations=self.config.linear_iterations,
         )
 
-    def _rounding_force(self, u: wp.array) -> float:
-        """The norm of the change of force that one rounding of u makes: no residual can be told from it."""
-        arguments = [self.operator.inverse_diagonal, self.model.types.epsilon, u]
-        self._launch("rounding", arguments, [self._part])
-        if self.model.supports is not None:
-            self.model.supports.project(self._part)
-        return float(np.sqrt(self.model.dot(self._part, self._part)))
+    def _rounding(self) -> tuple[float, float]:
+        """The norm of the change of force that one rounding makes, and its work: less cannot be told from it."""
+        model = self.model
+        arguments = [self.operator.inverse_diagonal, model.mass, self._weight, model.types.epsilon, self._u, self._d]
+        self._sum.zero_()
+        self._launch("rounding", arguments, [self._part, self._sum])
+        if model.supports is not None:
+            model.supports.project(self._part)
+        return float(np.sqrt(model.dot(self._part, self._part))), float(self._sum.numpy()[0])
 
 
 @dataclass(frozen=True)

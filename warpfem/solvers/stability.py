@@ -138,7 +138,7 @@ class Watch:
                 f"{available:.3g} J were there to be had; {where}; {worst_cell(model, state.u)}. Explicit steps of "
                 f"{dt:.3g} s are too long here: {advice}"
             )
-        if speed[fastest] * dt > self._size:
+        if moving and speed[fastest] * dt > self._size:
             raise SimulationError(
                 f"t = {state.time:.6g} s: {where}: further than the size of the body, {self._size:.3g} m, in a step "
                 f"of {dt:.3g} s: {advice}"

@@ -106,9 +106,9 @@ class _StaticStepper(_BackwardEulerStepper):
         return self._u
 
     def _choose_start(self, state: State) -> float:
-        wp.copy(self._u, state.u)
-        self._hold(self._u)
-        return self._potential(self._u)
+        self._d.zero_()
+        self._move(self._d, self._u)
+        return self._potential(self._d, self._u)
 
 
 def free_rigid_modes(model: Model, index: int) -> list[str]:
