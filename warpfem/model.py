@@ -219,6 +219,7 @@ class Model:
         except (RuntimeError, ValueError, TypeError) as error:
             known = ", ".join(str(known.alias) for known in wp.get_devices())
             raise SceneError(f"no device '{device}': there is {known}") from error
+        _require_resolved(scene, self.types.epsilon, dtype)
         meshes = [body.mesh for body in scene.bodies]
         self.point_starts = np.concatenate([[0], np.cumsum([mesh.point_count for mesh in meshes])])
         self.cell_starts = np.concatenate([[0], np.cumsum([mesh.cell_count for mesh in meshes])])
@@ -517,6 +518,22 @@ def _point_vectors(what: str, value: np.ndarray, shape: tuple[int, int]) -> np.n
     if bad.any():
         raise SimulationError(f"{what} is not finite at point {int(np.argmax(bad))} ({int(bad.sum())} in all)")
     return array
+
+
+def _require_resolved(scene: Scene, epsilon: float, dtype: str) -> None:
+    """Refuses cells so thin that displacements of a body's size cannot tell their points apart."""
+    for body in scene.bodies:
+        mesh = body.mesh
+        B = mesh.inverse_shape_matrices
+        steepest = np.maximum(np.linalg.norm(B, axis=2).max(axis=1), np.linalg.norm(B.sum(axis=1), axis=1))
+        size = float(np.linalg.norm(np.ptp(mesh.bounding_box, axis=0)))
+        thin = np.flatnonzero(steepest * (10.0 * epsilon * size) > 1.0)
+        if len(thin):
+            advice = "remesh" if dtype == "float64" else 'take dtype="float64", or remesh'
+            raise SceneError(
+                f"body '{body.name}': cell {thin[0]} is {1.0 / steepest[thin[0]]:.2g} m high ({len(thin)} such cells): "
+                f"{dtype} resolves no less than {10.0 * epsilon * size:.2g} m in a body of {size:.3g} m: {advice}"
+            )
 
 
 def _lumped_mass(scene: Scene) -> np.ndarray:

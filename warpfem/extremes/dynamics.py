@@ -29,7 +29,7 @@ from warpfem.extremes.table import Trial, at_most, case
 from warpfem.materials import LinearElasticity
 from warpfem.model import Energies
 from warpfem.scene import Body, Scene
-from warpfem.simulation import Frame, Simulation
+from warpfem.simulation import AUTO_FRACTION, Frame, Simulation
 from warpfem.solvers import Solver
 
 # --- 12: mass contrast ----------------------------------------------------------------------------------
@@ -130,7 +130,8 @@ def _flight(
     "dt from 1e-6 to 10 s at E from 1e3 to 1e11",
     "30 steps. Unloaded from a stretch of 10 % with noise of 1 % and no momentum, backward Euler: the total energy in "
     "the second half of the run is at no time above that halfway, and at the end below that of the start, to 1e-4 of "
-    "the start. In free fall from a place 0.1 m from that at rest, implicit steps: the speed is g t to 1e-3. Pinned, "
+    "the start. In free fall from a place 0.1 m from that at rest, implicit steps: the speed is g t to 1e-3, or steps "
+    "of one linear solve are reported as not converged (in float32, hundreds of kilometres from the start). Pinned, "
     "under gravity, from rest, backward Euler: the total energy, which is 0 at the start, is never above 1e-3 of its "
     "largest part. Linearised backward Euler, unloaded: never above 10 times the start. Explicit steps, unloaded: "
     "below the limit within 35 % of the start, above it refused.",
@@ -165,7 +166,12 @@ def _fall(label: str, setting: Setting, solver: Solver, dt: float) -> Trial:
         last = frame
     mass = simulation.model.lumped_mass
     speed = -momentum(mass, last.velocity)[1] / mass.sum()
-    return at_most(label, abs(speed / (9.81 * last.time) - 1.0), 1e-3)
+    trial = at_most(label, abs(speed / (9.81 * last.time) - 1.0), 1e-3)
+    summary = simulation.summary
+    if trial.status == "FAIL" and solver == LINEARISED and summary.unconverged_steps:
+        reported = f"{summary.unconverged_steps} of {summary.steps} steps not converged: {summary.worst_note}"
+        return Trial(label, "refused", trial.measured, reported)
+    return trial
 
 
 def _over_time_steps(
@@ -553,10 +559,11 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
     "impact at 100 m/s on a plane and on a sphere",
     "A cube of 0.4 m, E = 1e5 (waves ten times slower than the impact) to 1e9 Pa, flies at a plane and at the middle "
     "of a sphere of radius 1 m, and the run lasts five times the flight through its own length. No boundary point "
-    "ever passes the sphere's centre or is more than the body's size inside an obstacle; at the end none is more than "
-    "a tenth of the size inside; the kinetic, elastic and contact energy is never more than 1.05 times that of the "
-    "start with implicit steps, or the multiple that the scheme itself has at half its limit, 3 for symplectic Euler, "
-    "4/3 for Verlet. Or refused.",
+    "ever comes below the sphere's centre within its radius or is more than the body's size inside an obstacle; at the "
+    "end none is more than a tenth of the size inside; the kinetic, elastic and contact energy is never more than 1.05 "
+    "times that of the start with implicit steps, or the multiple that the scheme itself has at the part of its limit "
+    'that dt = "auto" takes, 4 for symplectic Euler, 1.6 for Verlet. Or refused. Linear elasticity meets the plane '
+    "alone: it lets bodies turn round a sphere by growing, at no cost.",
 )
 def impact(quick: bool) -> Iterator[Trial]:
     solvers: list[tuple[Solver, float | None]] = [
@@ -568,10 +575,10 @@ def impact(quick: bool) -> Iterator[Trial]:
         solvers += [(NEWTON, 1.0 / 120.0), (LINEARISED, 2e-4), (LINEARISED, 1.0 / 120.0), (EXPLICIT[0], None)]
     stiffnesses = (1e5, 1e9) if quick else (1e5, 1e7, 1e9)
     for setting, (solver, dt), E in product(settings(quick), solvers, stiffnesses):
-        for obstacle in (
-            Plane(setting.vector(), setting.vector(0.0, 1.0)),
-            Sphere(setting.vector(0.0, -1.0), 1.0),
-        ):
+        obstacles: list[Obstacle] = [Plane(setting.vector(), setting.vector(0.0, 1.0))]
+        if setting.material is not LinearElasticity:
+            obstacles.append(Sphere(setting.vector(0.0, -1.0), 1.0))
+        for obstacle in obstacles:
             step = "dt = 'auto'" if dt is None else f"dt = {dt:.3g} s"
             label = f"{setting}, {solver_name(solver)}, {step}, E = {E:g} Pa, {type(obstacle).__name__}"
             yield attempt(_thrown, label, setting, solver, dt, E, obstacle, may_refuse=True)
@@ -587,17 +594,18 @@ def _thrown(label: str, setting: Setting, solver: Solver, dt: float | None, E: f
     scene = Scene([body], solver, dt=dt or "auto", fps=fps, frames=frames, obstacles=[obstacle])
     simulation = Simulation(scene, device="cpu", dtype=setting.dtype)
     surface = mesh.boundary_points
-    lowest, deepest, energy = np.inf, 0.0, []
+    behind, deepest, energy = False, 0.0, []
     for frame in simulation.frames():
-        height = (mesh.points + frame.displacement)[surface, 1]
-        lowest = min(lowest, float(height.min()))
+        x = (mesh.points + frame.displacement)[surface]
+        behind |= isinstance(obstacle, Sphere) and bool(
+            ((x[:, 1] < -1.0) & (np.linalg.norm(np.delete(x, 1, axis=1), axis=1) < 1.0)).any()
+        )
         deepest = max(deepest, frame.penetration)
         energy.append(frame.energies.total)
-    far = isinstance(obstacle, Sphere) and lowest < -1.0
     figures = f"deepest {deepest:.2g} m, at the end {frame.penetration:.2g} m, energy x {max(energy) / energy[0]:.3g}"
-    if far or deepest > size:
-        return Trial(label, "FAIL", figures, "tunnels" if far else "goes in whole")
-    most = natural_growth(solver, 0.5) if solver in EXPLICIT else 1.05
+    if behind or deepest > size:
+        return Trial(label, "FAIL", figures, "tunnels" if behind else "goes in whole")
+    most = natural_growth(solver, AUTO_FRACTION) if solver in EXPLICIT else 1.05
     if not (frame.penetration <= 0.1 * size and max(energy) <= most * energy[0]):
         return Trial(label, "FAIL", figures)
     return Trial(label, "pass", figures)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,9 +26,10 @@ from warpfem.extremes.motion import (
 from warpfem.extremes.table import Trial, at_most, case, refused
 from warpfem.materials import StableNeoHookean
 from warpfem.mesh import Mesh
+from warpfem.model import Model
 from warpfem.record import run
 from warpfem.scene import Body, Scene
-from warpfem.solvers import Solver
+from warpfem.solvers import Solver, StaticEquilibrium
 
 # --- 15: slivers ----------------------------------------------------------------------------------------
 
@@ -105,11 +107,16 @@ def _bounded(label: str, setting: Setting, solver: Solver, mesh: Mesh) -> Trial:
     "everything pinned, one element, zero gravity, zero frames",
     "Everything pinned, under gravity: no displacement and no velocity at all after 5 steps. One element let go from "
     "a stretch of 10 %: as a body with a sliver. Gravity of zero: the bits of a scene without. No frames: the initial "
-    "one alone, without a step, also in a file.",
+    "one alone, without a step, also in a file. A static equilibrium with nothing pinned: refused, with the rigid "
+    "motions by name; with everything pinned: no displacement.",
 )
 def degenerate(quick: bool) -> Iterator[Trial]:
-    # Nothing pinned in a static solve, which must name the rigid modes, belongs here too.
     for setting in settings(quick):
+        label = f"{setting}, StaticEquilibrium, nothing pinned"
+        modes = ["translation along y", "rotation about (0.5" if setting.dim == 2 else "rotation about z through (0.5"]
+        yield refused(label, partial(_static, setting, ()), "body 'body'", *modes)
+        label = f"{setting}, StaticEquilibrium, everything pinned"
+        yield attempt(_static_pinned, label, setting)
         corners = np.concatenate([np.zeros((1, setting.dim)), np.eye(setting.dim)])
         simplex = Mesh(corners, np.arange(setting.dim + 1)[None])
         for solver in (*IMPLICIT, *EXPLICIT):
@@ -123,6 +130,21 @@ def degenerate(quick: bool) -> Iterator[Trial]:
 
 def _brick(setting: Setting) -> Mesh:
     return setting.brick((1.0, 1.0, 1.0), (2, 2, 2))
+
+
+def _static(setting: Setting, points: Sequence[int]) -> np.ndarray:
+    """The displacement of a brick under its weight, pinned at these points."""
+    body = Body("body", _brick(setting), setting.material(E=1e5, nu=0.3), supports=[Pin(points)] if len(points) else [])
+    scene = Scene([body], IMPLICIT[0], gravity=setting.vector(0.0, -9.81))
+    model = Model(scene, device="cpu", dtype=setting.dtype)
+    state = model.state()
+    StaticEquilibrium().solve(model, state)
+    return state.displacement
+
+
+def _static_pinned(label: str, setting: Setting) -> Trial:
+    everything = np.arange(_brick(setting).point_count)
+    return at_most(label, float(np.abs(_static(setting, everything)).max()), 0.0)
 
 
 def _all_pinned(label: str, setting: Setting, solver: Solver) -> Trial:
