@@ -86,11 +86,11 @@ def _contrast_in_flight(label: str, setting: Setting, solver: Solver) -> Iterato
     frames, steps = 100, 10
     dt = 0.5 * stable_dt(setting, column, solver)
     simulation = setting.simulation([column], solver, dt, frames, steps)
-    yield from _flight(label, simulation, frames * steps, energy_limit=0.1)
+    yield from _flight(label, simulation, frames * steps, energy_limit=0.1, drift_limit=0.02)
 
 
 def _flight(
-    label: str, simulation: Simulation, steps: int, energy_limit: float, spins: bool = False
+    label: str, simulation: Simulation, steps: int, energy_limit: float, drift_limit: float, spins: bool = False
 ) -> Iterator[Trial]:
     """Runs a free flight and looks at what it ought to conserve."""
     model = simulation.model
@@ -111,9 +111,7 @@ def _flight(
     total = np.array(energy) / energy[0]
     fifth = len(total) // 5
     yield at_most(f"{label}: energy", float(np.abs(total - 1.0).max()), energy_limit)
-    yield at_most(
-        f"{label}: drift of energy", float(abs(total[-fifth:].mean() - total[:fifth].mean())), 0.2 * energy_limit
-    )
+    yield at_most(f"{label}: drift of energy", float(abs(total[-fifth:].mean() - total[:fifth].mean())), drift_limit)
     allowed = steps**0.5 * epsilon
     change = float(np.linalg.norm(np.array(linear) - linear[0], axis=1).max())
     yield at_most(f"{label}: linear momentum", change / size, allowed)
@@ -299,17 +297,18 @@ def _above_limit(label: str, setting: Setting, solver: Solver, factor: float) ->
 @case(
     16,
     "1e5 Verlet steps in free flight",
-    "A spinning, vibrating block, dt half the limit (quick: 2000 steps): at all frames the energy within 5 % of the "
-    "start, its means over the first and the last fifth within 1 %; the linear momentum within sqrt(steps) roundings "
-    "of the sum of m |v|; the angular momentum within ten times as many of the sum of m |x| |v| (not for linear "
-    "elasticity, whose rotated bodies grow).",
+    "A block that spins, vibrates and travels about five of its lengths, dt half the limit (quick: 2000 steps): at "
+    "all frames the energy within 1/3 of the start, the swing that the scheme itself has in its fastest mode, and its "
+    "means over the first and the last fifth within 1 %; the linear momentum within sqrt(steps) roundings of the sum "
+    "of m |v|; the angular momentum within ten times as many of the sum of m |x| |v| (not for linear elasticity, "
+    "whose rotated bodies grow).",
 )
 def long_flight(quick: bool) -> Iterator[Trial]:
     for setting in settings(quick):
         vibrating = _let_go(setting, "stretch")
 
         def motion(x: np.ndarray, dim: int = setting.dim) -> np.ndarray:
-            return _whirl(x - x.mean(axis=0), 0.5) + (1.0, 0.5, -0.5)[:dim]
+            return _whirl(x - x.mean(axis=0), 0.5) + (0.01, 0.005, -0.005)[:dim]
 
         body = Body(
             "block",
@@ -322,7 +321,9 @@ def long_flight(quick: bool) -> Iterator[Trial]:
         dt = 0.5 * stable_dt(setting, body, VERLET)
         simulation = setting.simulation([body], VERLET, dt, frames, steps)
         rotates = setting.material is not LinearElasticity
-        yield from _flight(str(setting), simulation, frames * steps, 0.05, spins=rotates)
+        yield from _flight(
+            str(setting), simulation, frames * steps, natural_growth(VERLET, 0.5) - 1.0, 0.01, spins=rotates
+        )
 
 
 def _whirl(x: np.ndarray, rate: float) -> np.ndarray:
