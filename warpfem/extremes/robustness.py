@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from warpfem.boundary import Pin, Plane, PointForce, PrescribedMotion, Sphere, Traction
+from warpfem.boundary import Pin, PointSelection, Plane, PointForce, PrescribedMotion, Sphere, Traction
 from warpfem.errors import WarpfemError
 from warpfem.extremes.motion import (
     EXPLICIT,
@@ -132,7 +132,7 @@ def _brick(setting: Setting) -> Mesh:
     return setting.brick((1.0, 1.0, 1.0), (2, 2, 2))
 
 
-def _static(setting: Setting, points: Sequence[int]) -> np.ndarray:
+def _static(setting: Setting, points: PointSelection) -> np.ndarray:
     """The displacement of a brick under its weight, pinned at these points."""
     body = Body("body", _brick(setting), setting.material(E=1e5, nu=0.3), supports=[Pin(points)] if len(points) else [])
     scene = Scene([body], IMPLICIT[0], gravity=setting.vector(0.0, -9.81))
