@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from warpfem.boundary import Pin, PointSelection, Plane, PointForce, PrescribedMotion, Sphere, Traction
+from warpfem.boundary import Pin, Plane, PointForce, PointSelection, PrescribedMotion, Sphere, Traction
 from warpfem.errors import WarpfemError
 from warpfem.extremes.motion import (
     EXPLICIT,
@@ -51,7 +51,7 @@ def slivers(quick: bool) -> Iterator[Trial]:
             yield attempt(_recovery, label, setting, solver, sliver(setting.dim, quality), may_refuse=coarse)
         for explicit in EXPLICIT[1:] if quick else EXPLICIT:
             label = f"{setting}, {solver_name(explicit)}, {quality:g}"
-            yield attempt(_bounded, label, setting, explicit, sliver(setting.dim, quality))
+            yield attempt(_bounded, label, setting, explicit, sliver(setting.dim, quality), may_refuse=coarse)
 
 
 def sliver(dim: int, quality: float) -> Mesh:
