@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, TypeAlias
 
@@ -79,6 +79,15 @@ def attempt(trial: Callable[..., Trial], setting: str, *arguments: Any, may_refu
         return trial(setting, *arguments)
     except WarpfemError as error:
         return Trial(setting, "refused" if may_refuse else "FAIL", "", str(error))
+
+
+def unless_reported(trial: Trial, solver: Solver, simulation: Simulation) -> Trial:
+    """The trial; one that failed by single linear solves counts as refused if its steps were reported as unsolved."""
+    summary = simulation.summary
+    if trial.status == "FAIL" and solver == LINEARISED and summary.unconverged_steps:
+        reported = f"{summary.unconverged_steps} of {summary.steps} steps not converged: {summary.worst_note}"
+        return replace(trial, status="refused", note=reported)
+    return trial
 
 
 def stable_dt(setting: Setting, body: Body, solver: Solver) -> float:

@@ -23,9 +23,9 @@ class StepReport:
     Attributes:
         newton_iterations: linear systems solved.
         cg_iterations: iterations of conjugate gradients over all of them.
-        residual: unbalanced force over the largest of the forces acting, at the end; 0 for explicit steps,
-            the linear solver's relative residual for linearised ones.
-        converged: whether the residual met the tolerance, or is below ``ROUNDING_LIMIT`` and lost in rounding.
+        residual: unbalanced force over the largest of the forces acting, at the end; 0 for explicit steps.
+        converged: whether the residual met the tolerance, or is below ``ROUNDING_LIMIT`` and lost in rounding, or no
+            force acts beyond rounding. A linearised step has solved its system and has not raised the potential.
         rounded: whether rounding hides what is left of the residual, so that no other step would do better.
         parts: steps that this one was divided into.
         note: how the step ended, if not by its tolerance.

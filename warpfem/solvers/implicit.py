@@ -250,6 +250,7 @@ class _BackwardEulerStepper(Stepper):
             self.model.contact.linearize_friction(state.u, self._dt, self._part)
         self._d.zero_()
         self._move(self._d, self._u)
+        start = self._potential(self._d, self._u)
         self._unbalanced_force(self._d, self._u)
         require_finite(self.model, self._force, "the force", time)
         self._linearize(self.config.hessian)
@@ -257,14 +258,20 @@ class _BackwardEulerStepper(Stepper):
         self._launch("add_scaled", [self._d, 1.0, self._direction], [self._d])
         self._move(self._d, self._u)
         require_finite(self.model, self._u, "the displacement", time)
-        residual = self._true_residual()
-        converged = result.status is LinearStatus.CONVERGED
-        if converged and residual > 10.0 * self.config.linear_tolerance:
-            converged = residual <= ROUNDING_LIMIT
-            note = f"resolved only to the rounding of {self.model.dtype}"
-            return StepReport(1, result.iterations, residual, converged, rounded=True, note=note)
-        note = "" if converged else f"conjugate gradients {result.status.value}"
-        return StepReport(1, result.iterations, residual, converged, note=note)
+        linear_residual = self._true_residual()
+        residual, scale = self._unbalanced_force(self._d, self._u)
+        relative = residual / scale if scale > 0.0 else 0.0
+        rounding = self._rounding()[1]
+        rise = self._potential(self._d, self._u) - start
+        if result.status is not LinearStatus.CONVERGED:
+            note = f"conjugate gradients {result.status.value}"
+        elif linear_residual > max(10.0 * self.config.linear_tolerance, ROUNDING_LIMIT):
+            note = f"rounding of {self.model.dtype} leaves {linear_residual:.1e} of the linear system's right-hand side"
+        elif not rise <= 1e-3 * abs(start) + rounding:
+            note = f"the linear system led {rise:.2g} J above the potential of standing still"
+        else:
+            note = ""
+        return StepReport(1, result.iterations, relative, not note, note=note)
 
     def _true_residual(self) -> float:
         """|b - A x| / |b| of the linear system: the one that conjugate gradients keep drifts away by rounding."""
