@@ -40,8 +40,9 @@ from warpfem.solvers import Solver, StaticEquilibrium
     "slivers of quality 1e-3 to 1e-6",
     "A body of 2 m with one such cell in its middle is let go from a stretch of 10 %. Implicit steps of 1 s: after "
     "20 the elastic energy is below 1e-6 of the start, a strain of 1e-4; or refused in float32 where the cell is less "
-    "than ten roundings of the size high, that is below quality 1e-5 in 2D and 1e-3 in 3D, or, with one linear solve a step, "
-    "reported as not converged. Explicit steps of half the limit, which the cell sets, with random velocities of 0.1 m/s, which make it quiver: in 400 of them the energy "
+    "than ten roundings of the size high, that is below quality 1e-5 in 2D and 1e-3 in 3D; or, with one linear solve a "
+    "step, reported as not converged. Explicit steps of half the limit, which the cell sets, with random velocities of "
+    "0.1 m/s, which make it quiver, refused in float32 likewise: in 400 of them the energy "
     "stays below the multiple of the start that the scheme itself has, 3 for symplectic Euler, 4/3 for Verlet.",
 )
 def slivers(quick: bool) -> Iterator[Trial]:

@@ -1,7 +1,7 @@
 """Backward Euler: each step minimises the incremental potential by Newton's method."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Literal
 
@@ -219,6 +219,8 @@ class _BackwardEulerStepper(Stepper):
         if model.contact is not None:
             model.contact.limit_friction(state.u)
         report = self._newton(state, time) if self.config.max_iterations > 1 else self._linearised(state, time)
+        if self._crosses_an_obstacle(state):
+            report = replace(report, converged=False, rounded=False, note="a point goes round or through a sphere")
         if not (report.converged or report.rounded or self.config.unconverged == "accept"):
             raise SimulationError(
                 f"{report.note}, with a residual of {report.residual:.1e}; {worst_cell(model, self._u)}"
@@ -231,6 +233,15 @@ class _BackwardEulerStepper(Stepper):
         state.time = time
         state.revision += 1
         return report
+
+    def _crosses_an_obstacle(self, state: State) -> bool:
+        """Whether the way of a point within the step, straight from its start, leads through the core of a sphere."""
+        contact = self.model.contact
+        if contact is None or not contact.limits_steps:
+            return False
+        self._limit.fill_(1.0)
+        contact.limit_step(state.u, self._d, self._limit)
+        return float(self._limit.numpy()[0]) < 1.0
 
     def prepare(self, state: State, dt: float) -> None:
         super().prepare(state, dt)
