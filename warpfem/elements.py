@@ -343,8 +343,9 @@ class ElementKernels:
             G = Q
             for k in range(dim):
                 G[k, (k + 1) % dim] += scalar(0.1)
+            G = deformation_gradient(H) * G  # turned with the body
             size = scalar(0.0)
-            rounds = int(2)
+            rounds = int(3)
             for _round in range(rounds):
                 G = G / wp.sqrt(wp.ddot(G, G))
                 G = stress_differential(H, G, parameters[i]) * Q

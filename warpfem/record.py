@@ -55,6 +55,9 @@ def record(
         raise OutputError(f"checkpoint_every must be a number of frames of at least 1, not {checkpoint_every!r}")
     scene, summary = simulation.scene, simulation.summary
     checkpoint_file, failure_file = checkpoint_path(path), failure_path(path)
+    for file in (checkpoint_file, failure_file):
+        if file.is_dir():
+            raise OutputError(f"{file} is a folder: move it away, a run of {path} needs the name")
     parts = scene_parts(simulation) if checkpoint_every or resume else {}
     start, keep = None, None
     if resume:

@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -161,14 +161,15 @@ class Simulation:
         solver: Solver | None = None,
     ) -> None:
         start = time.perf_counter()
-        self.scene = scene
-        self.model = Model(scene, device=device, dtype=dtype)
+        self.scene = scene if solver is None else replace(scene, solver=solver)
+        self.model = Model(self.scene, device=device, dtype=dtype)
         self.state = self.model.state()
-        self.solver = solver or scene.solver
+        self.solver = self.scene.solver
         self.stepper = self.solver.stepper(self.model)
         self._warned: set[str] = set()  # bodies whose inverted cells have been told of
         interval = 1.0 / scene.fps
         self._rest_limit = self.stepper.stable_dt(self.state) if scene.dt == "auto" else None
+        self.stepper.adaptive = self._rest_limit is not None
         wanted = scene.dt
         if wanted == "auto":
             wanted = interval if self._rest_limit is None else AUTO_FRACTION * self._rest_limit
@@ -184,8 +185,8 @@ class Simulation:
     def restore(self, index: int, time: float, displacement: np.ndarray, velocity: np.ndarray) -> Frame:
         """Takes the state of an earlier run at a frame: :meth:`frames` then goes on with the next one.
 
-        On the CPU the frames are the same as without the interruption, to the last bit: all that a frame's steps
-        depend on is the state at its start.
+        On the CPU the frames are the same as without the interruption, to the last bit, if :attr:`summary` has taken
+        up the totals of the earlier run too: ``dt="auto"`` looks at the steps done, and at the limit seen last.
 
         Args:
             index: index of the frame.
@@ -226,7 +227,7 @@ class Simulation:
             summary.stepping_seconds += time.perf_counter() - start
             frame = self._observe(index)
             summary.add_frame(frame)
-            if index == self.scene.frames and self._warned:
+            if index == self.scene.frames and summary.smallest_jacobian <= 0.0:
                 self._warn_of_folds(frame)
             yield frame
 
@@ -304,7 +305,7 @@ class Simulation:
         """Warns of bodies that had inverted cells and ended with none, but folded into themselves."""
         rest = self.model.rest_points
         for body, (own, cells) in zip(self.scene.bodies, body_slices(self.model), strict=True):
-            if body.name not in self._warned or (frame.jacobian[cells] <= 0.0).any():
+            if (frame.jacobian[cells] <= 0.0).any():
                 continue
             folded = folds(body.mesh, (rest + frame.displacement)[own])
             if len(folded):

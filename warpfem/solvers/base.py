@@ -41,7 +41,7 @@ class StepReport:
 
     def __add__(self, other: StepReport) -> StepReport:
         """The report of this step and the next as one; its end is that of the worse."""
-        worse = self if (not self.converged, self.residual) >= (not other.converged, other.residual) else other
+        worse = max(self, other, key=lambda part: (not part.converged, part.rounded, part.residual))
         return replace(
             worse,
             newton_iterations=self.newton_iterations + other.newton_iterations,
@@ -56,10 +56,13 @@ class Stepper(ABC):
     Attributes:
         model: the model.
         attempt: displacements at which the last step failed, device array, where there are other than the state's.
+        adaptive: whether dt is chosen by :meth:`estimate_stable_dt`: then a dt above the limit of the moment is not
+            refused, since the next one will be shorter.
     """
 
     model: Model
     attempt: wp.array | None = None
+    adaptive: bool = False
 
     @abstractmethod
     def step(self, state: State, dt: float) -> StepReport:
@@ -86,7 +89,7 @@ class Stepper(ABC):
         return None
 
     def estimate_stable_dt(self, state: State) -> float | None:
-        """:meth:`stable_dt` of ``state`` alone, at a fraction of the cost and within a few per cent."""
+        """:meth:`stable_dt` of ``state`` alone, estimated at a fraction of the cost."""
         return None
 
     def prepare(self, state: State, dt: float) -> None:

@@ -58,6 +58,7 @@ class _ExplicitStepper(Stepper):
         self._limit: float | None = None
         self._watch: Watch | None = None
         self._watched_speed = 0.0
+        self._seen: tuple[State, int] | None = None  # state and revision that the watch has followed
         self._alarm = wp.zeros(1, dtype=wp.int32, device=model.device)
         self._steps = 0
         self._interval = int(np.clip(model.cell_count // 16, *TRACKING_INTERVALS))
@@ -78,21 +79,21 @@ class _ExplicitStepper(Stepper):
 
     def estimate_stable_dt(self, state: State) -> float:
         if self._watch is None:
-            self._watch = Watch(self.model, state)
+            self._watch, self._seen = Watch(self.model, state), (state, state.revision)
         return self._watch.stable_dt(state.u)
 
     def prepare(self, state: State, dt: float) -> None:
         super().prepare(state, dt)
-        self._limit = self._watch = None
-        self._watched_speed, self._steps = 0.0, 0
+        self._watch, self._steps = None, 0
 
     def _check_dt(self, state: State, dt: float) -> None:
         require_positive(dt)
-        if self._limit is None:
-            self._limit = self.stable_dt(state)
-        if self._watch is None:
+        if self._limit is None:  # of the first state, also where a run is taken up in the middle
+            self._limit = self.stable_dt(self.model.state())
+        if self._watch is None or self._seen != (state, state.revision):
             self._watch = Watch(self.model, state)
-        if dt > self._limit and dt > 0.9 * self._watch.stable_dt(state.u):  # it may have grown since
+            self._watched_speed = 0.0
+        if dt > self._limit:
             raise TimeStepError(
                 f"dt = {dt:.4g} s is above the stability limit of explicit steps in this scene, "
                 f'{self._limit:.4g} s: take a smaller dt, dt="auto", or BackwardEuler'
@@ -101,6 +102,7 @@ class _ExplicitStepper(Stepper):
     def _look(self, state: State, dt: float) -> None:
         """Now and then, and where points have become faster than ever, looks whether the run is still stable."""
         self._steps += 1
+        self._seen = (state, state.revision)
         device = self.model.device
         readable = device.is_cpu or self._steps % ALARM_INTERVAL == 0  # elsewhere reading waits for the device
         if readable and self._alarm.numpy()[0]:
@@ -108,6 +110,8 @@ class _ExplicitStepper(Stepper):
             self._watch.require_bounded(state, dt)
             self._watched_speed = 2.0 * float(np.linalg.norm(state.velocity, axis=1).max())
         elif self._steps % self._interval:
+            return
+        if self.adaptive:
             return
         limit = self._watch.is_unstable(state, dt)
         if limit is not None:

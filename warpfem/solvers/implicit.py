@@ -170,7 +170,7 @@ class _BackwardEulerStepper(Stepper):
         try:
             return self._single_step(state, dt)
         except SimulationError as failure:
-            hopeless = not np.isfinite(self.model.elastic_energy(state.u))
+            hopeless = not np.isfinite(self.model.energies(state).total)
             if self.config.unconverged == "accept" or hopeless:
                 raise
             return self._step_in_parts(state, dt, failure)
@@ -183,13 +183,15 @@ class _BackwardEulerStepper(Stepper):
         while lengths:
             try:
                 part = self._single_step(state, lengths[-1])
-            except SimulationError as error:
-                if lengths[-1] < 1.5 * dt / 2**MAX_HALVINGS:
+            except BaseException as error:
+                if not isinstance(error, SimulationError) or lengths[-1] < 1.5 * dt / 2**MAX_HALVINGS:
                     self.attempt = self._u
                     wp.copy(state.u, start.u)
                     wp.copy(state.v, start.v)
                     state.time = start.time
                     state.revision += 1
+                    if not isinstance(error, SimulationError):  # of a motion that a user wrote, or Ctrl-C
+                        raise
                     raise SimulationError(
                         f"t = {start.time:.6g} s: the step of {dt:.4g} s cannot be solved, nor in parts of "
                         f"{lengths[-1]:.3g} s: {error}"
@@ -270,8 +272,7 @@ class _BackwardEulerStepper(Stepper):
         self._move(self._d, self._u)
         require_finite(self.model, self._u, "the displacement", time)
         linear_residual = self._true_residual()
-        residual, scale = self._unbalanced_force(self._d, self._u)
-        relative = residual / scale if scale > 0.0 else 0.0
+        relative = _largest_ratio(*self._unbalanced_force(self._d, self._u))
         rounding = self._rounding()[1]
         rise = self._potential(self._d, self._u) - start
         if result.status is not LinearStatus.CONVERGED:
@@ -310,18 +311,18 @@ class _BackwardEulerStepper(Stepper):
             if rough and 0 < iteration <= FRICTION_UPDATES:
                 model.contact.limit_friction(self._u)
                 potential = self._potential(self._d, self._u)
-            residual, scale = self._unbalanced_force(self._d, self._u)
-            if not np.isfinite(residual):
+            residuals, scales = self._unbalanced_force(self._d, self._u)
+            if not np.isfinite(residuals).all():
                 require_finite(model, self._force, "the force", time)
-            relative = residual / scale if scale > 0.0 else 0.0
+            relative = _largest_ratio(residuals, scales)
             if relative <= config.tolerance:
                 return StepReport(solves, cg_iterations, relative)
             if iteration == config.max_iterations:
                 break
             self._linearize("exact")
-            rounding, noise = self._rounding()
-            if residual <= rounding:
-                return self._rounded(solves, cg_iterations, relative, scale <= 4.0 * rounding)
+            roundings, noise = self._rounding()
+            if (residuals <= np.maximum(roundings, config.tolerance * scales)).all():
+                return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             result = self._solve(forcing)
             solves += 1
@@ -340,7 +341,7 @@ class _BackwardEulerStepper(Stepper):
             found = self._line_search(potential, slope, noise)
             if found is None:
                 if -slope <= noise:
-                    return self._rounded(solves, cg_iterations, relative, scale <= 4.0 * rounding)
+                    return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
                 note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
                 break
             potential = found
@@ -449,27 +450,39 @@ class _BackwardEulerStepper(Stepper):
         load = 0.0 if model.dead_load is None else model.dot(model.dead_load, u)
         return float(total.numpy()[0]) - load
 
-    def _unbalanced_force(self, d: wp.array, u: wp.array) -> tuple[float, float]:
-        """Writes -dPhi/dd to ``_force``, zero where held; returns its norm and that of the largest part."""
+    def _unbalanced_force(self, d: wp.array, u: wp.array) -> tuple[np.ndarray, np.ndarray]:
+        """Writes -dPhi/dd to ``_force``, zero where held.
+
+        Returns:
+            For each body, since none feels another, its norm and that of the largest of its parts, where not held.
+        """
         model, force, part = self.model, self._force, self._part
         self._launch("inertia_force", [model.mass, self._weight, self._predicted, d], [force])
-        sizes = [model.dot(force, force)]
+        sizes = [self._free_norms(force)]
         part.zero_()
         model.add_internal_force(u, part)
-        sizes.append(model.dot(part, part))
+        sizes.append(self._free_norms(part))
         self._launch("add_scaled", [force, 1.0, part], [force])
         if model.dead_load is not None:
-            sizes.append(model.dot(model.dead_load, model.dead_load))
-            self._launch("add_scaled", [force, 1.0, model.dead_load], [force])
+            wp.copy(part, model.dead_load)
+            sizes.append(self._free_norms(part))
+            self._launch("add_scaled", [force, 1.0, part], [force])
         if model.contact is not None:
             part.zero_()
             model.contact.add_force(u, part)
             model.contact.add_friction_force(self._start, self._dt, u, part)
-            sizes.append(model.dot(part, part))
+            sizes.append(self._free_norms(part))
             self._launch("add_scaled", [force, 1.0, part], [force])
+        return self._free_norms(force), np.max(sizes, axis=0)
+
+    def _free_norms(self, vector: wp.array) -> np.ndarray:
+        """Sets the held components of a vector to zero; returns its norm over each body's points."""
+        model = self.model
         if model.supports is not None:
-            model.supports.project(force)
-        return float(np.sqrt(model.dot(force, force))), float(np.sqrt(max(sizes)))
+            model.supports.project(vector)
+        ranges = zip(model.point_starts, model.point_starts[1:], strict=False)
+        parts = [vector[int(a) : int(b)] for a, b in ranges]
+        return np.sqrt([model.dot(part, part) for part in parts])
 
     def _linearize(self, hessian: Hessian) -> None:
         friction = None if self.model.contact is None else (self._start, self._dt)
@@ -484,15 +497,19 @@ class _BackwardEulerStepper(Stepper):
             max_iterations=self.config.linear_iterations,
         )
 
-    def _rounding(self) -> tuple[float, float]:
-        """The norm of the change of force that one rounding makes, and its work: less cannot be told from it."""
+    def _rounding(self) -> tuple[np.ndarray, float]:
+        """What cannot be told from rounding: each body's norm of the force that one rounding makes, and its work."""
         model = self.model
         arguments = [self.operator.inverse_diagonal, model.mass, self._weight, model.types.epsilon, self._u, self._d]
         self._sum.zero_()
         self._launch("rounding", arguments, [self._part, self._sum])
-        if model.supports is not None:
-            model.supports.project(self._part)
-        return float(np.sqrt(model.dot(self._part, self._part))), float(self._sum.numpy()[0])
+        work = float(self._sum.numpy()[0])
+        return self._free_norms(self._part), work
+
+
+def _largest_ratio(residuals: np.ndarray, scales: np.ndarray) -> float:
+    """The largest of residuals relative to their scales; a residual on which nothing acts counts as 0."""
+    return float(np.divide(residuals, scales, out=np.zeros_like(scales), where=scales > 0.0).max())
 
 
 @dataclass(frozen=True)
@@ -503,8 +520,9 @@ class BackwardEuler(Solver):
     potential. :meth:`linearised` is the lecture's single linear solve.
 
     Attributes:
-        tolerance: largest accepted norm of the unbalanced force, relative to the largest of inertia,
-            internal force, load and contact; it does not depend on units, dt or mesh size.
+        tolerance: largest accepted norm of the unbalanced force of any body, relative to the largest of its
+            inertia, internal force, load and contact, where it is not held; it does not depend on units, dt or
+            mesh size.
         max_iterations: Newton iterations; 1 takes the linearised step.
         hessian: what Newton's method does where the stiffness is not positive definite, which the linear solve
             notices: "absolute" takes the absolute values of each cell's eigenvalues (Chen et al. 2024),

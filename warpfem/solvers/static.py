@@ -1,6 +1,5 @@
 """Static equilibrium: the state of least potential under the loads, without inertia."""
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +7,7 @@ import warp as wp
 
 from warpfem.errors import SceneError, SimulationError
 from warpfem.folds import folds
+from warpfem.mesh import Mesh
 from warpfem.model import Model, State
 from warpfem.scene import Body
 from warpfem.solvers.base import StepReport, worst_cell
@@ -28,11 +28,11 @@ class StaticEquilibrium:
     max_iterations: int = 200
 
     def __post_init__(self) -> None:
-        self._settings  # noqa: B018 - it checks the values
-
-    @functools.cached_property
-    def _settings(self) -> BackwardEuler:
-        return BackwardEuler(tolerance=self.tolerance, max_iterations=max(2, self.max_iterations))
+        number = self.max_iterations
+        if isinstance(number, bool) or not isinstance(number, int) or number < 2:
+            raise SceneError(f"StaticEquilibrium: max_iterations must be an integer >= 2, not {number!r}")
+        if not (isinstance(self.tolerance, float | int) and 0.0 < self.tolerance < 1.0):
+            raise SceneError(f"StaticEquilibrium: tolerance must be in (0, 1), not {self.tolerance!r}")
 
     def solve(self, model: Model, state: State) -> StepReport:
         """Moves ``state`` to the equilibrium that descent from it leads to, at rest.
@@ -46,18 +46,17 @@ class StaticEquilibrium:
                 state is then as it was before.
         """
         for index, body in enumerate(model.scene.bodies):
-            modes = free_rigid_modes(model, index)
-            if modes:
+            for part, modes in free_rigid_modes(model, index):
                 raise SceneError(
-                    f"body '{body.name}' can move freely: {'; '.join(modes)}. A static equilibrium needs pins against "
-                    "that (obstacles do not count)"
+                    f"body '{body.name}'{part} can move freely: {'; '.join(modes)}. A static equilibrium needs pins "
+                    "against that (obstacles do not count)"
                 )
         if model.contact is not None and model.contact.rough:
             raise SceneError(
                 "with friction the equilibrium depends on the way there: take friction=0, or BackwardEuler with "
                 "damping until the bodies rest"
             )
-        stepper = _StaticStepper(model, self._settings)
+        stepper = _StaticStepper(model, BackwardEuler(self.tolerance, self.max_iterations))
         report = stepper.solve(state)
         u = State(stepper.solution, state.v)
         jacobian, _ = model.diagnostics(u)
@@ -94,7 +93,7 @@ class _StaticStepper(_BackwardEulerStepper):
         if self.model.supports is not None:
             self.model.supports.advance(state.time, 0.0)
         report = self._newton(state, state.time)
-        if not (report.converged or report.rounded):
+        if not report.converged:
             raise SimulationError(
                 f"no static equilibrium found: {report.note}, with a residual of {report.residual:.1e}; "
                 f"{worst_cell(self.model, self._u)}. Start nearer to it, or with smaller loads"
@@ -111,16 +110,44 @@ class _StaticStepper(_BackwardEulerStepper):
         return self._potential(self._d, self._u)
 
 
-def free_rigid_modes(model: Model, index: int) -> list[str]:
-    """The rigid motions of a body, for small angles, that its supports leave free, in words.
+def free_rigid_modes(model: Model, index: int) -> list[tuple[str, list[str]]]:
+    """The rigid motions, for small angles, that supports leave free to the connected parts of a body.
 
     Args:
         model: the model.
         index: number of the body in the scene.
+
+    Returns:
+        For each part that can move, its name, empty if the body is of one piece, and the motions in words.
     """
     body = model.scene.bodies[index]
     points, held = _held(model, index)
-    dim = model.dim
+    parts = connected_parts(body.mesh)
+    result = []
+    for number in np.unique(parts):
+        own = parts[points] == number
+        modes = _free_modes(body, points[own], held[own])
+        name = f", the part with point {number}," if parts.any() else ""
+        if modes:
+            result.append((name, modes))
+    return result
+
+
+def connected_parts(mesh: Mesh) -> np.ndarray:
+    """For each point the least number of a point that cells connect it with, (point_count,)."""
+    parts = np.arange(mesh.point_count)
+    while True:
+        least = parts[mesh.cells].min(axis=1)
+        lower = parts.copy()
+        np.minimum.at(lower, mesh.cells, least[:, None])
+        lower = lower[lower]  # of that point in turn: few rounds suffice
+        if (lower == parts).all():
+            return parts
+        parts = lower
+
+
+def _free_modes(body: Body, points: np.ndarray, held: np.ndarray) -> list[str]:
+    dim = body.mesh.dim
     origin = body.mesh.points[points].mean(axis=0) if len(points) else body.mesh.points.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(body.mesh.bounding_box, axis=0)))
     arms = (body.mesh.points[points] - origin) / size
@@ -198,4 +225,4 @@ def _direction(vector: np.ndarray) -> str:
 
 
 def _place(point: np.ndarray) -> str:
-    return f"({', '.join(f'{c:.3g}' for c in np.round(point, 9) + 0.0)})"
+    return f"({', '.join(f'{c:.6g}' for c in np.round(point, 9) + 0.0)})"

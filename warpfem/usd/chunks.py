@@ -189,6 +189,10 @@ class ChunkedLayer:
         set_clock(layer, self._static.framesPerSecond, self.frame_count)
         Sdf.CreatePrimInLayer(layer, WORLD).SetInfo("customData", metadata)
 
+    def discard(self) -> None:
+        """Removes the partial file."""
+        self._remove()
+
     def _remove(self) -> None:
         remove(self.path)
         if self._folder.exists():

@@ -162,6 +162,9 @@ class UsdWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
+            if error is not None and self._layer.frame_count == 0:  # an older file is worth more than an empty one
+                self._layer.discard()
+                self._closed = True
             self.close()
         except OutputError as output_error:
             if error is None or kind is GeneratorExit:  # which nobody gets to see
