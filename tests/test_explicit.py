@@ -10,12 +10,12 @@ from stepping import EXPLICIT, MATERIALS, advance, dense_stiffness, mean, modes,
 
 from warpfem.boundary import BoxWalls, Pin, Plane, PrescribedMotion
 from warpfem.errors import SimulationError, TimeStepError
-from warpfem.materials import LinearElasticity, NeoHookean
+from warpfem.materials import LinearElasticity, NeoHookean, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.scene import Body, Scene
 from warpfem.simulation import Simulation
 from warpfem.solvers import SymplecticEuler, VelocityVerlet
-from warpfem.solvers.stability import Watch
+from warpfem.solvers.stability import Watch, largest_frequency
 
 
 def irregular(dim, **settings):
@@ -213,3 +213,33 @@ def test_stiff_thin_cells_set_the_limit():
         limits.append(ready(scene)[2].stable_dt())
     assert limits[1] == pytest.approx(2.0 * limits[0])  # a length over a wave speed
     assert limits[0] < 0.01 / np.sqrt(1e5 / 1000.0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_estimate_of_the_limit_turns_with_the_body(dim):
+    body = slab(dim, material=StableNeoHookean(E=1e5, nu=0.49))
+    model, state, _ = ready(Scene([body], SymplecticEuler()))
+    at_rest = Watch(model, state).stable_dt(state.u)
+    x = model.rest_points
+    turned = np.column_stack([-x[:, 1], x[:, 0], *x[:, 2:].T])
+    state.assign(displacement=turned - x)
+    assert Watch(model, state).stable_dt(state.u) == pytest.approx(at_rest, rel=1e-6)
+    assert at_rest == pytest.approx(2.0 / largest_frequency(model), rel=0.02)
+
+
+def test_a_state_that_is_given_another_velocity_is_no_blow_up():
+    _, state, stepper = ready(Scene([slab(2)], VelocityVerlet()))
+    advance(stepper, state, 1e-4, 5)
+    state.assign(velocity=np.broadcast_to([30.0, 0.0], state.velocity.shape))
+    advance(stepper, state, 1e-4, 5)
+    assert state.time == pytest.approx(1e-3)
+
+
+def test_a_body_that_rides_with_its_support_is_no_blow_up():
+    def ride(rest, time):
+        return rest + np.array([1e4 * time, 0.0])
+
+    body = slab(2, supports=[PrescribedMotion("left", ride)], velocity=(1e4, 0.0))
+    simulation = Simulation(Scene([body], VelocityVerlet(), fps=100.0, frames=3), dtype="float64")
+    *_, last = simulation.frames()
+    assert np.abs(last.displacement[:, 0] - 300.0).max() < 0.1

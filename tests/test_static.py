@@ -102,3 +102,20 @@ def test_friction_and_failures_are_refused():
     )
     with pytest.raises(SimulationError, match=r"2 inverted cells: cell \d of body 'crushed' has J = -"):
         solved(crushed)
+
+
+def test_every_part_of_a_body_needs_supports():
+    one = Mesh.rectangle((1.0, 1.0), (1, 1))
+    two = Mesh(
+        np.concatenate([one.points, one.points + np.array([3.0, 0.0])]),
+        np.concatenate([one.cells, one.cells + one.point_count]),
+    )
+    body = Body("pair", two, MATERIALS[2], supports=[Pin(np.arange(4))])
+    with pytest.raises(SceneError, match="body 'pair', the part with point 4, can move freely: translation along x"):
+        solved(body)
+
+
+@pytest.mark.parametrize("value", [1, 2.5, None, True])
+def test_refuses_settings(value):
+    with pytest.raises(SceneError, match="StaticEquilibrium: max_iterations must be an integer >= 2"):
+        StaticEquilibrium(max_iterations=value)
