@@ -26,6 +26,9 @@ from warpfem.solvers.base import (
 MAX_HALVINGS = 10
 """How often a step that fails is halved before it is refused."""
 
+STAGNANT_ROUNDINGS = 16.0
+"""Roundings of the force, one for each of the cells about a point, that a residual may hold that no longer falls."""
+
 FRICTION_UPDATES = 10
 """Newton iterations of a step that take the friction limits of their iterate; later ones keep the last, so that
 they minimise one potential and cannot circle between two sets of sliding points."""
@@ -317,12 +320,13 @@ class _BackwardEulerStepper(Stepper):
             relative = _largest_ratio(residuals, scales)
             if relative <= config.tolerance:
                 return StepReport(solves, cg_iterations, relative)
-            if iteration == config.max_iterations:
-                break
+            last = iteration == config.max_iterations
             self._linearize("exact")
             roundings, noise = self._rounding()
-            if (residuals <= np.maximum(roundings, config.tolerance * scales)).all():
+            if self._is_noise(residuals, scales, STAGNANT_ROUNDINGS * roundings if last else roundings):
                 return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
+            if last:
+                break
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             result = self._solve(forcing)
             solves += 1
@@ -340,12 +344,16 @@ class _BackwardEulerStepper(Stepper):
             noise += 16.0 * model.types.epsilon * abs(potential)
             found = self._line_search(potential, slope, noise)
             if found is None:
-                if -slope <= noise:
+                if -slope <= noise or self._is_noise(residuals, scales, STAGNANT_ROUNDINGS * roundings):
                     return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
                 note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
                 break
             potential = found
         return StepReport(solves, cg_iterations, relative, False, note=note)
+
+    def _is_noise(self, residuals: np.ndarray, scales: np.ndarray, roundings: np.ndarray) -> bool:
+        """Whether each body's residual meets the tolerance or cannot be told from rounding."""
+        return bool((residuals <= np.maximum(roundings, self.config.tolerance * scales)).all())
 
     def _rounded(self, solves: int, cg_iterations: int, relative: float, all_is_noise: bool) -> StepReport:
         """The end of a step of which rounding hides the rest: good if that is little, or if no force acts at all."""
