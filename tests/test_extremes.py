@@ -108,6 +108,7 @@ def cases(monkeypatch) -> dict[int, Case]:
     """Three cases instead of the real ones."""
     made = {i: Case(i, f"title {i}", f"criterion {i}", f) for i, f in enumerate((two_passes, one_failure, a_crash), 1)}
     monkeypatch.setattr("warpfem.extremes.CASES", made)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)  # processes of their own would not see them
     return made
 
 

@@ -256,7 +256,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if summary.unconverged_steps:
         print(
             f"warpfem: NOT CONVERGED in {summary.unconverged_steps} of {summary.steps} steps: worst residual "
-            f"{summary.worst_residual:.2e}, {summary.worst_note}",
+            f"{summary.worst_residual:.2e}, {summary.worst_note}"
+            + ("; --dtype float64 resolves more" if "float32" in summary.worst_note else ""),
             file=sys.stderr,
         )
     if arguments.json:
@@ -414,10 +415,10 @@ def _extremes(arguments: argparse.Namespace) -> int:
     if say:
         print(report.text_header(), flush=True)
     outcomes = []
-    for number in sorted(set(arguments.case) or CASES):
-        outcomes.append(report.run_case(CASES[number], arguments.quick))
+    for outcome in report.run_cases(sorted(set(arguments.case) or CASES), arguments.quick, _start_warp):
+        outcomes.append(outcome)
         if say:
-            print(report.text_row(outcomes[-1]), flush=True)
+            print(report.text_row(outcome), flush=True)
     if arguments.json:
         print(json.dumps(report.json_data(outcomes, arguments.quick), indent=2, allow_nan=False))
     if out:

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import FloatName
-from warpfem.errors import SimulationError, TimeStepError
+from warpfem.errors import SceneError, SimulationError, TimeStepError
 from warpfem.folds import folds
 from warpfem.model import Energies, Model
 from warpfem.scene import Scene
@@ -24,6 +24,9 @@ AUTO_FRACTION = 0.6
 
 AUTO_INTERVAL = 32
 """Explicit steps after which ``dt="auto"`` looks at the limit again."""
+
+MOST_STEPS = 10**8
+"""Steps in a frame that would take an hour even for a single cell."""
 
 LEAST_FRACTION = 1e-3
 """The part of the first step of ``dt="auto"`` below which a run would hardly get on."""
@@ -175,6 +178,11 @@ class Simulation:
             wanted = interval if self._rest_limit is None else AUTO_FRACTION * self._rest_limit
         self.steps_per_frame = max(1, math.ceil(interval / wanted - 1e-9))
         self.dt = interval / self.steps_per_frame
+        if self.steps_per_frame > MOST_STEPS and scene.frames > 0:
+            raise SceneError(
+                f"a frame of {interval:.3g} s would take {self.steps_per_frame:.3g} steps of {self.dt:.3g} s: raise "
+                "fps, or take BackwardEuler with a longer dt"
+            )
         if scene.frames > 0:
             self.stepper.prepare(self.state, self.dt)
         self._observe(0)
@@ -236,6 +244,7 @@ class Simulation:
         if self._rest_limit is None:
             for _ in range(self.steps_per_frame):
                 self._step()
+            self.state.time = end  # without the rounding of many steps
             return
         summary, interval = self.summary, 1.0 / self.scene.fps
         while (left := end - self.state.time) > 1e-9 * interval:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import importlib.metadata
 import math
+import os
 import platform
 import time
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from itertools import repeat
+from multiprocessing import get_context
 from pathlib import Path
 
 import warpfem
@@ -59,6 +63,28 @@ def run_case(case: Case, quick: bool) -> Outcome:
     if not trials:
         trials.append(Trial("all", "FAIL", "", "the case tried nothing"))
     return Outcome(case, trials, time.perf_counter() - start)
+
+
+def run_cases(numbers: Sequence[int], quick: bool, start: Callable[[], None]) -> Iterator[Outcome]:
+    """Runs cases in as many processes as there are processors; yields their outcomes in the order of the numbers.
+
+    Args:
+        numbers: of the cases.
+        quick: whether to try few settings.
+        start: called in each process first.
+    """
+    workers = min(len(numbers), os.cpu_count() or 1)
+    if workers == 1:
+        yield from (_run_number(number, quick) for number in numbers)
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn"), start) as pool:
+        yield from pool.map(_run_number, numbers, repeat(quick))
+
+
+def _run_number(number: int, quick: bool) -> Outcome:
+    from warpfem.extremes import CASES  # all of them, in a process of its own too
+
+    return run_case(CASES[number], quick)
 
 
 def failed(outcomes: Sequence[Outcome]) -> int:

@@ -29,18 +29,17 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
     def kick_drift(
         force: wp.array(dtype=vector),
         inverse_mass: wp.array(dtype=scalar),
-        decay_before: scalar,
+        decay: scalar,
         kick: scalar,
-        decay_after: scalar,
         drift: scalar,
         watched_speed: scalar,
         u_out: wp.array(dtype=vector),
         v_out: wp.array(dtype=vector),
         alarm_out: wp.array(dtype=wp.int32),
     ):
-        """v = decay_after (decay_before v + kick f / m), then u += drift v; an alarm where |v| is not below a limit."""
+        """v = decay v + kick f / m, then u += drift v; an alarm where |v| is not below a limit."""
         i = wp.tid()
-        v = decay_after * (decay_before * v_out[i] + (kick * inverse_mass[i]) * force[i])
+        v = decay * v_out[i] + (kick * inverse_mass[i]) * force[i]
         v_out[i] = v
         u_out[i] += drift * v
         if not (wp.length(v) <= watched_speed):
@@ -107,7 +106,7 @@ class _ExplicitStepper(Stepper):
         readable = device.is_cpu or self._steps % ALARM_INTERVAL == 0  # elsewhere reading waits for the device
         if readable and self._alarm.numpy()[0]:
             self._alarm.zero_()
-            self._watch.require_bounded(state, dt)
+            self._watch.require_bounded(state, dt, self.adaptive)
             self._watched_speed = 2.0 * float(np.linalg.norm(state.velocity, axis=1).max())
         elif self._steps % self._interval:
             return
@@ -120,19 +119,20 @@ class _ExplicitStepper(Stepper):
                 f'{limit:.4g} s: take a smaller dt, dt="auto", or BackwardEuler'
             )
 
-    def _kick_drift(
-        self, state: State, kick: float, drift: float, decay_before: float = 1.0, decay_after: float = 1.0
-    ) -> None:
+    def _kick_drift(self, state: State, kick: float, drift: float) -> None:
+        """Lets forces and damping act for a time, as v' = f / m - alpha v has it, then moves for another."""
         model = self.model
+        alpha = model.scene.damping
+        decay = float(np.exp(-alpha * kick))
+        kick = float(-np.expm1(-alpha * kick)) / alpha if alpha > 0.0 else kick
         wp.launch(
             self._kernel,
             model.point_count,
             inputs=[
                 self._force,
                 model.inverse_mass,
-                decay_before,
+                decay,
                 kick,
-                decay_after,
                 drift,
                 self._watched_speed,
             ],
@@ -158,13 +158,12 @@ class _SymplecticEulerStepper(_ExplicitStepper):
     def step(self, state: State, dt: float) -> StepReport:
         self._begin(state, dt)
         self.model.force(state.u, self._force)
-        decay = float(np.exp(-self.model.scene.damping * dt))
         if self._rough:  # friction acts between the new velocity and the drift
-            self._kick_drift(state, dt, 0.0, decay_before=decay)
+            self._kick_drift(state, dt, 0.0)
             self._rub(state, dt)
             self._kick_drift(state, 0.0, dt)
         else:
-            self._kick_drift(state, dt, dt, decay_before=decay)
+            self._kick_drift(state, dt, dt)
         self._hold(state)
         state.time += dt
         state.revision += 1
@@ -181,17 +180,16 @@ class _VelocityVerletStepper(_ExplicitStepper):
         self._begin(state, dt)
         if self._known is None or self._known[0] is not state or self._known[1] != state.revision:
             self.model.force(state.u, self._force)
-        decay = float(np.exp(-0.5 * self.model.scene.damping * dt))
         half = 0.5 * dt
         if self._rough:
-            self._kick_drift(state, half, 0.0, decay_before=decay)
+            self._kick_drift(state, half, 0.0)
             self._rub(state, half)
             self._kick_drift(state, 0.0, dt)
         else:
-            self._kick_drift(state, half, dt, decay_before=decay)
+            self._kick_drift(state, half, dt)
         self._hold(state)
         self.model.force(state.u, self._force)
-        self._kick_drift(state, half, 0.0, decay_after=decay)
+        self._kick_drift(state, half, 0.0)
         self._rub(state, half)
         self._hold(state)
         state.time += dt
@@ -205,7 +203,7 @@ class _VelocityVerletStepper(_ExplicitStepper):
 class SymplecticEuler(Solver):
     """v += dt f(u) / m, then u += dt v (Hu 2020): one force a step, stable for dt < 2 / omega_max.
 
-    Mass-proportional damping is the exact decay exp(-alpha dt) of the velocity.
+    Mass-proportional damping acts with the force, as v' = f / m - alpha v has it for a force that stays.
     """
 
     name = "symplectic_euler"
@@ -219,7 +217,7 @@ class SymplecticEuler(Solver):
 class VelocityVerlet(Solver):
     """Half a kick, a drift, half a kick: one force a step, stable for dt < 2 / omega_max, second order.
 
-    Mass-proportional damping is split symmetrically (Strang), which keeps the order. Prescribed motions
+    Mass-proportional damping acts in both kicks, which keeps the order. Prescribed motions
     enter by the mean velocity of each step.
     """
 

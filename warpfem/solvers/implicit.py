@@ -26,6 +26,9 @@ from warpfem.solvers.base import (
 MAX_HALVINGS = 10
 """How often a step that fails is halved before it is refused."""
 
+POLISH = 1e-4
+"""Relative residual of the last linear solve of a step that rounding ends."""
+
 STAGNANT_ROUNDINGS = 16.0
 """Roundings of the force, one for each of the cells about a point, that a residual may hold that no longer falls."""
 
@@ -309,6 +312,7 @@ class _BackwardEulerStepper(Stepper):
                 "state with J > 0, move supports more slowly, or take StableNeoHookean, which bears inversion"
             )
         solves = cg_iterations = 0
+        polished = False
         note = f"stopped after {config.max_iterations} Newton iterations"
         for iteration in range(config.max_iterations + 1):
             if rough and 0 < iteration <= FRICTION_UPDATES:
@@ -323,11 +327,14 @@ class _BackwardEulerStepper(Stepper):
             last = iteration == config.max_iterations
             self._linearize("exact")
             roundings, noise = self._rounding()
+            forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             if self._is_noise(residuals, scales, STAGNANT_ROUNDINGS * roundings if last else roundings):
-                return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
+                if polished or last:
+                    return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
+                # noise of stiff cells may hide a force that moves the whole body, but not from one more solve
+                polished, forcing = True, POLISH
             if last:
                 break
-            forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             result = self._solve(forcing)
             solves += 1
             cg_iterations += result.iterations
