@@ -131,7 +131,7 @@ class Plane(_Obstacle):
         normal: outward normal, of any length.
         friction: Coulomb coefficient, >= 0.
         stiffness: pressure per depth of penetration [Pa/m]; ``None`` takes the body's P-wave modulus
-            over its mean edge length, or what stops the body, from the speed at which it starts towards the
+            over its mean edge length, or what stops the body, from the speed at which it starts and falls towards the
             plane, within a quarter of its thickness, if that is more.
     """
 

@@ -23,7 +23,8 @@ from warpfem.mesh import Mesh
 from warpfem.scene import Body
 
 STOPPING_DEPTH = 0.25
-"""Part of a body's thickness within which the default stiffness stops it from the speed that it starts with."""
+"""Part of a body's thickness within which the default stiffness stops it, from the speed that it starts with and
+gains as it falls."""
 
 
 @functools.cache
@@ -279,6 +280,7 @@ class _ObstacleContact:
         dim = surface.rest.shape[1]
         t = types(dim, dtype)
         self.kernels = contact_kernels(type(obstacle), dim, dtype)
+        self.obstacle = obstacle
         self.friction = obstacle.friction
         self.device = surface.device
         self.count = len(surface.rest)
@@ -293,7 +295,9 @@ class _ObstacleContact:
             origin = surface.rest - np.array(obstacle.center)
             outward = origin / np.maximum(np.linalg.norm(origin, axis=1, keepdims=True), obstacle.radius)
         approach = np.maximum(-(surface.velocity * outward).sum(axis=1), 0.0)
-        default = np.maximum(surface.stiffness, surface.stopping * approach**2)
+        height = np.maximum(self._gap(obstacle, surface.rest), 0.0) + surface.stopping_depth
+        fall = np.maximum(-(surface.gravity * outward).sum(axis=-1), 0.0) * height
+        default = np.maximum(surface.stiffness, surface.stopping * (approach**2 + 2.0 * fall))
         pressure_rate = default if obstacle.stiffness is None else obstacle.stiffness
         self.shape = [t.vector(*axis), t.scalar(radius)]
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
@@ -303,6 +307,17 @@ class _ObstacleContact:
         if self.friction > 0.0:
             self.magnitude = wp.zeros(self.count, dtype=t.scalar, device=self.device)
             self.normal = wp.zeros(self.count, dtype=t.vector, device=self.device)
+
+    @staticmethod
+    def _gap(obstacle: Plane | Sphere, x: np.ndarray) -> np.ndarray:
+        """The distance of points from an obstacle, negative inside [m]."""
+        if isinstance(obstacle, Plane):
+            return (x - np.array(obstacle.point)) @ np.array(obstacle.normal)
+        return np.linalg.norm(x - np.array(obstacle.center), axis=1) - obstacle.radius
+
+    def depth(self, x: np.ndarray) -> float:
+        """The greatest depth of points inside the obstacle [m], negative if all are outside."""
+        return float(-self._gap(self.obstacle, x).min())
 
     def arrays(self) -> list[wp.array]:
         own = [self.origin, self.stiffness]
@@ -332,13 +347,20 @@ def _bearing_areas(mesh: Mesh) -> np.ndarray:
 class ContactSurface:
     """The boundary points of all bodies with their rest places, areas, initial velocities and default stiffness.
 
-    ``stopping`` times the square of the speed at which a body approaches an obstacle is the stiffness [Pa/m] that
-    stops it within ``STOPPING_DEPTH``: per area, k d^2 / 2 = rho L v^2 / 2 for a body of thickness L that hits with
-    all its mass.
+    ``stopping`` times v^2 + 2 g h is the stiffness [Pa/m] that stops a body within ``STOPPING_DEPTH``, which starts
+    towards an obstacle at the speed v and falls on it from the height h: per area, k d^2 / 2 = rho L (v^2 / 2 + g h)
+    for a body of thickness L that hits with all its mass; h counts the depth d.
     """
 
-    def __init__(self, bodies: Sequence[Body], starts: Sequence[int], p_wave: Sequence[float], device) -> None:
-        rest, points, areas, stiffness, velocity, stopping = [], [], [], [], [], []
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        starts: Sequence[int],
+        p_wave: Sequence[float],
+        gravity: Sequence[float] | None,
+        device,
+    ) -> None:
+        rest, points, areas, stiffness, velocity, stopping, depth = [], [], [], [], [], [], []
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
             mesh = body.mesh
             rest.append(mesh.points[mesh.boundary_points])
@@ -349,7 +371,10 @@ class ContactSurface:
             thickness = float(np.ptp(mesh.bounding_box, axis=0).min())
             inertia = np.max(body.density) / (STOPPING_DEPTH**2 * thickness)
             stopping.append(np.full(len(mesh.boundary_points), inertia))
+            depth.append(np.full(len(mesh.boundary_points), STOPPING_DEPTH * thickness))
         self.device = device
+        self.gravity = np.zeros(bodies[0].mesh.dim) if gravity is None else np.asarray(gravity, dtype=np.float64)
+        self.stopping_depth = np.concatenate(depth)
         self.rest = np.concatenate(rest)
         self.host_points = np.concatenate(points)
         self.points = wp.array(self.host_points, dtype=wp.int32, device=device)
@@ -369,19 +394,15 @@ class Contact:
     def __init__(self, obstacles: Sequence[Obstacle], surface: ContactSurface, slip_speed: float, dtype: str) -> None:
         self.surface = surface
         self.slip_speed = slip_speed
-        self._obstacles: list[Plane | Sphere] = []
         self.parts: list[_ObstacleContact] = []
         self._host_stiffness = np.zeros(len(surface.rest))
         for obstacle in obstacles:
             single = obstacle.planes() if isinstance(obstacle, BoxWalls) else [obstacle]
-            self._obstacles += single
             self.parts += [_ObstacleContact(one, surface, dtype) for one in single]
             # once for the walls of a box: those that a point can touch together are perpendicular
             self._host_stiffness += self.parts[-1].host_stiffness
         self._rough = [part for part in self.parts if part.friction > 0.0]
-        self._balls = [
-            part for part, obstacle in zip(self.parts, self._obstacles, strict=True) if isinstance(obstacle, Sphere)
-        ]
+        self._balls = [part for part in self.parts if isinstance(part.obstacle, Sphere)]
 
     @property
     def limits_steps(self) -> bool:
@@ -404,14 +425,7 @@ class Contact:
     def depth(self, u: np.ndarray) -> float:
         """The greatest depth of penetration [m] at the displacements ``u`` (n, dim); 0 without contact."""
         x = self.surface.rest + u[self.surface.host_points]
-        deepest = 0.0
-        for obstacle in self._obstacles:
-            if isinstance(obstacle, Plane):
-                gap = (x - np.array(obstacle.point)) @ np.array(obstacle.normal)
-            else:
-                gap = np.linalg.norm(x - np.array(obstacle.center), axis=1) - obstacle.radius
-            deepest = max(deepest, float(-gap.min()))
-        return deepest
+        return max(0.0, *(part.depth(x) for part in self.parts))
 
     def add_energy(self, u: wp.array, energy_out: wp.array) -> None:
         """Adds the penalty energy to ``energy_out[0]``."""

@@ -259,7 +259,8 @@ class Model:
             return None
         from warpfem.contact import Contact, ContactSurface
 
-        surface = ContactSurface(self.scene.bodies, self.point_starts[:-1], self._p_wave_moduli(), self.device)
+        scene, starts = self.scene, self.point_starts[:-1]
+        surface = ContactSurface(scene.bodies, starts, self._p_wave_moduli(), scene.gravity, self.device)
         return Contact(self.scene.obstacles, surface, self._slip_speed(), self.dtype)
 
     def _p_wave_moduli(self) -> list[float]:

@@ -312,7 +312,7 @@ class _BackwardEulerStepper(Stepper):
                 "state with J > 0, move supports more slowly, or take StableNeoHookean, which bears inversion"
             )
         solves = cg_iterations = 0
-        polished = False
+        polished = 0
         note = f"stopped after {config.max_iterations} Newton iterations"
         for iteration in range(config.max_iterations + 1):
             if rough and 0 < iteration <= FRICTION_UPDATES:
@@ -329,10 +329,11 @@ class _BackwardEulerStepper(Stepper):
             roundings, noise = self._rounding()
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             if self._is_noise(residuals, scales, STAGNANT_ROUNDINGS * roundings if last else roundings):
-                if polished or last:
-                    return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
+                all_is_noise = bool((scales <= 4.0 * roundings).all())
+                if last or polished == 2 or (polished and self._correction() <= ROUNDING_LIMIT):
+                    return self._rounded(solves, cg_iterations, relative, all_is_noise)
                 # noise of stiff cells may hide a force that moves the whole body, but not from one more solve
-                polished, forcing = True, POLISH
+                polished, forcing = polished + 1, POLISH
             if last:
                 break
             result = self._solve(forcing)
@@ -367,8 +368,13 @@ class _BackwardEulerStepper(Stepper):
         model = self.model
         at_rest = all_is_noise and model.dead_load is None and model.contact_energy(self._u) == 0.0
         note = f"resolved only to the rounding of {model.dtype}"
-        converged = at_rest or relative <= ROUNDING_LIMIT
+        converged = at_rest or min(relative, self._correction()) <= ROUNDING_LIMIT
         return StepReport(solves, cg_iterations, relative, converged, rounded=True, note=note)
+
+    def _correction(self) -> float:
+        """The size of the last linear solve's solution, relative to the increment."""
+        size, correction = self.model.dot(self._d, self._d), self.model.dot(self._direction, self._direction)
+        return (correction / size) ** 0.5 if size > 0.0 else np.inf
 
     def _choose_start(self, state: State) -> float:
         """Starts from the old state or from free flight, whichever has less potential and can be reached."""
