@@ -500,3 +500,46 @@ def test_obstacles_stop_a_body_on_which_nothing_else_acts(solver):
     advance(stepper, state, dt, round(0.5 / dt), lambda: depths.append(model.contact.depth(state.displacement)))
     assert 0.0 < max(depths) < 0.05
     assert np.abs(mean(model, state.displacement)).max() < 0.1
+
+
+@pytest.mark.parametrize("E", [1e2, 1e4])
+def test_the_default_obstacle_stops_a_soft_body_that_falls(E):
+    """A body far too soft to bear its own fall flattens on the floor, but does not sink through it."""
+    mesh = Mesh.rectangle((1.0, 1.0), (3, 3), origin=(0.0, 0.3))
+    floor = Plane((0.0, 0.0), (0.0, 1.0))
+    scene = Scene(
+        [Body("jelly", mesh, StableNeoHookean(E=E, nu=0.3))], BackwardEuler(), gravity=(0.0, -9.81), obstacles=[floor]
+    )
+    model, state, stepper = ready(scene)
+    deepest = 0.0
+    for _ in range(40):
+        stepper.step(state, 0.02)
+        deepest = max(deepest, model.contact.depth(state.displacement))
+    assert 0.0 < deepest < 0.25
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_long_step_does_not_leap_over_a_sphere(dim):
+    mesh = (
+        Mesh.rectangle((0.4, 0.4), (2, 2), (-0.2, 0.1))
+        if dim == 2
+        else Mesh.box((0.4,) * 3, (2, 2, 2), (-0.2, 0.1, -0.2))
+    )
+    body = Body("cube", mesh, StableNeoHookean(E=1e9, nu=0.3), velocity=(0.0, -100.0, 0.0)[:dim])
+    sphere = Sphere((0.0, -1.0, 0.0)[:dim], 1.0)
+    model, state, stepper = ready(Scene([body], BackwardEuler(), obstacles=[sphere]))
+    stepper.step(state, 1.0 / 24.0)  # by itself the body would fly 4 m, to the far side
+    x = model.rest_points + state.displacement
+    assert x[:, 1].min() > -0.1
+
+
+def test_a_linearised_step_into_contact_says_so():
+    floor = Plane((0.0, 0.0), (0.0, 1.0), stiffness=1e9)
+    mesh = Mesh.rectangle((1.0, 1.0), (2, 2), (0.0, 0.01))
+    body = Body("block", mesh, StableNeoHookean(E=1e6, nu=0.3), velocity=(0.0, -10.0))
+    model, state, stepper = ready(Scene([body], LINEARISED, obstacles=[floor]))
+    before = model.energies(state).total
+    report = stepper.step(state, 0.01)
+    assert model.energies(state).total > before  # it did not see the floor
+    assert not report.converged
+    assert "above the potential of standing still" in report.note

@@ -136,6 +136,7 @@ def test_auto_dt_minds_the_first_state():
     assert simulation.dt < 0.5 * simulation.stepper.stable_dt()
 
 
+@pytest.mark.filterwarnings("ignore:.*inverted")
 def test_summary_counts_unconverged_steps():
     hard = cube(
         supports=[wf.Pin("bottom")],
@@ -227,6 +228,7 @@ def test_device_bytes_count_a_uniform_array_once():
     assert device_bytes([model.mass]) == 8 * 4
 
 
+@pytest.mark.filterwarnings("ignore:.*inverted")
 def test_a_body_without_volume_is_no_failure_for_a_material_that_bears_inversion():
     flat = cube(displacement=lambda x: -x * (0, 1, 0), dt=1e-3, fps=20, frames=4)
     frames = list(wf.Simulation(flat).frames())
@@ -264,3 +266,21 @@ def test_run_returns_the_summary_and_writes_the_file(tmp_path):
     assert summary.frames == 3
     assert summary.last_energies.kinetic > 0.0
     assert out.is_file()
+
+
+def test_steel_falls_in_float32_though_its_noise_hides_gravity():
+    block = wf.Mesh.rectangle((1.0, 1.0), (4, 4), (0.0, 0.3))
+    steel = wf.Body("steel", block, wf.StableNeoHookean(E=2e11, nu=0.3), density=7800.0)
+    floor = wf.Plane((0.0, 0.0), (0.0, 1.0))
+    scene = wf.Scene([steel], wf.BackwardEuler(), gravity=(0.0, -9.81), obstacles=[floor], frames=24)
+    frames = list(wf.Simulation(scene, device="cpu").frames())
+    fallen = [frame.displacement[:, 1].mean() for frame in frames]
+    steps = np.arange(5)
+    np.testing.assert_allclose(fallen[:5], -9.81 * steps * (steps + 1) / 2 / 24**2, rtol=1e-4)  # backward Euler's
+    assert fallen[-1] == pytest.approx(-0.3, abs=1e-4)
+
+
+def test_frames_of_too_many_steps_are_refused():
+    speck = wf.Body("speck", wf.Mesh.rectangle((4e-9, 4e-9), (2, 2)), wf.StableNeoHookean(E=1e9, nu=0.3))
+    with pytest.raises(wf.errors.SceneError, match=r"a frame of 0.0417 s would take .* steps of .* s: raise fps"):
+        wf.Simulation(wf.Scene([speck], wf.VelocityVerlet()), device="cpu", dtype="float64")
