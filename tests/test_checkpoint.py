@@ -385,10 +385,15 @@ def test_checkpoints_come_every_so_many_frames(tmp_path: Path, every) -> None:
 
 
 def test_a_simulation_can_be_restored_without_a_file() -> None:
-    whole = list(wf.Simulation(pushed_block()).frames())
+    first, whole, totals = wf.Simulation(pushed_block()), [], {}
+    for frame in first.frames():
+        whole.append(frame)
+        if frame.index == 4:
+            totals = first.summary.totals()
     simulation = wf.Simulation(pushed_block())
     state = whole[4]
     restored = simulation.restore(4, state.time, state.displacement, state.velocity)
+    simulation.summary.take_up(totals)
     np.testing.assert_array_equal(restored.von_mises, state.von_mises)
     rest = list(simulation.frames())
     assert [frame.index for frame in rest] == [5, 6, 7, 8, 9]

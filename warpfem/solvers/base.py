@@ -13,8 +13,8 @@ from warpfem.errors import SimulationError
 from warpfem.model import Model, State
 
 ROUNDING_LIMIT = 1e-2
-"""Largest relative residual, or relative change by the last linear solve, that a step may end with where rounding
-hides the rest."""
+"""Largest relative residual, and relative change by the last linear solve, with which a step counts as converged
+where rounding hides the rest."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class StepReport:
         newton_iterations: linear systems solved.
         cg_iterations: iterations of conjugate gradients over all of them.
         residual: unbalanced force over the largest of the forces acting, at the end; 0 for explicit steps.
-        converged: whether the residual met the tolerance; or is lost in rounding, while it, or what the last linear
-            solve changed of the increment, is below ``ROUNDING_LIMIT``, or no force acts beyond rounding. A
-            linearised step has solved its system and has not raised the potential.
+        converged: whether the residual met the tolerance; or is lost in rounding, and below ``ROUNDING_LIMIT``, or
+            not much above while the last linear solve hardly changed the increment, or no force acts beyond
+            rounding. A linearised step has solved its system and has not raised the potential.
         rounded: whether rounding hides what is left of the residual, so that no other step would do better.
         parts: steps that this one was divided into.
         note: how the step ended, if not by its tolerance.
