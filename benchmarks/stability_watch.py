@@ -28,7 +28,7 @@ def seconds(stepper, state, dt: float) -> float:
 def main() -> None:
     wp.config.log_level = wp.LOG_ERROR
     print("tetrahedra   us a step   alarm   alarm and limit")
-    for cells in (4, 8, 16, 24):
+    for cells in (4, 8, 16):
         mesh = wf.Mesh.box((1.0, 1.0, 1.0), (cells,) * 3)
         body = wf.Body("box", mesh, wf.StableNeoHookean(E=1e5, nu=0.3), displacement=lambda x: 0.05 * x)
         model = Model(wf.Scene([body], wf.VelocityVerlet()), device="cpu")
@@ -38,7 +38,7 @@ def main() -> None:
         look, estimate = stepper._look, stepper._watch.is_unstable
         times: dict[str, list[float]] = {"none": [], "alarm": [], "both": []}
         for _ in range(ROUNDS):
-            stepper._look = lambda state, dt: None
+            stepper._look = lambda state, dt, own=stepper: setattr(own, "_seen", (state, state.revision))
             times["none"].append(seconds(stepper, state, dt))
             stepper._look, stepper._watch.is_unstable = look, lambda state, dt: None
             times["alarm"].append(seconds(stepper, state, dt))
