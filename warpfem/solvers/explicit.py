@@ -1,6 +1,7 @@
 """Explicit time integration: symplectic Euler and velocity Verlet."""
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,7 @@ class _ExplicitStepper(Stepper):
         self._watched_speed = 0.0
         self._seen: tuple[State, int] | None = None  # state and revision that the watch has followed
         self._alarm = wp.zeros(1, dtype=wp.int32, device=model.device)
+        self._alarm_on_host = self._alarm.numpy() if model.device.is_cpu else None  # making the view costs a launch
         self._steps = 0
         self._interval = int(np.clip(model.cell_count // 16, *TRACKING_INTERVALS))
 
@@ -102,9 +104,7 @@ class _ExplicitStepper(Stepper):
         """Now and then, and where points have become faster than ever, looks whether the run is still stable."""
         self._steps += 1
         self._seen = (state, state.revision)
-        device = self.model.device
-        readable = device.is_cpu or self._steps % ALARM_INTERVAL == 0  # elsewhere reading waits for the device
-        if readable and self._alarm.numpy()[0]:
+        if self._alarmed():
             self._alarm.zero_()
             self._watch.require_bounded(state, dt, self.adaptive)
             self._watched_speed = 2.0 * float(np.linalg.norm(state.velocity, axis=1).max())
@@ -119,23 +119,24 @@ class _ExplicitStepper(Stepper):
                 f'{limit:.4g} s: take a smaller dt, dt="auto", or BackwardEuler'
             )
 
+    def _alarmed(self) -> bool:
+        """Whether a point has become faster than ever; off the CPU, where reading waits, that is asked now and then."""
+        if self._alarm_on_host is not None:
+            return bool(self._alarm_on_host[0])
+        return self._steps % ALARM_INTERVAL == 0 and bool(self._alarm.numpy()[0])
+
     def _kick_drift(self, state: State, kick: float, drift: float) -> None:
         """Lets forces and damping act for a time, as v' = f / m - alpha v has it, then moves for another."""
         model = self.model
         alpha = model.scene.damping
-        decay = float(np.exp(-alpha * kick))
-        kick = float(-np.expm1(-alpha * kick)) / alpha if alpha > 0.0 else kick
+        decay = 1.0
+        if alpha > 0.0:
+            decay = math.exp(-alpha * kick)
+            kick = -math.expm1(-alpha * kick) / alpha
         wp.launch(
             self._kernel,
             model.point_count,
-            inputs=[
-                self._force,
-                model.inverse_mass,
-                decay,
-                kick,
-                drift,
-                self._watched_speed,
-            ],
+            inputs=[self._force, model.inverse_mass, decay, kick, drift, self._watched_speed],
             outputs=[state.u, state.v, self._alarm],
             device=model.device,
         )
