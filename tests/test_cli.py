@@ -234,20 +234,16 @@ def test_a_dt_above_the_limit_is_refused_before_anything_is_written(tmp_path, ca
     assert list(tmp_path.iterdir()) == []
 
 
+def long_run(out: Path, **streams) -> subprocess.Popen:
+    """The command in a process of its own, at work for long enough to be ended from outside."""
+    scene = str(SCENES / "jelly_drop.py")
+    command = [sys.executable, "-m", "warpfem", "run", scene, "--out", str(out), "--frames", "2000"]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, **streams)
+
+
 def test_a_killed_run_leaves_its_frames(tmp_path):
     out = tmp_path / "jelly.usdc"
-    command = [
-        sys.executable,
-        "-m",
-        "warpfem",
-        "run",
-        str(SCENES / "jelly_drop.py"),
-        "--out",
-        str(out),
-        "--frames",
-        "2000",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    process = long_run(out, stderr=subprocess.DEVNULL)
     partial = tmp_path / "jelly.partial.usda"
     frames = 0
     deadline = time.monotonic() + 120
@@ -270,18 +266,7 @@ def test_a_killed_run_leaves_its_frames(tmp_path):
 
 def test_interrupt_ends_cleanly(tmp_path):
     out = tmp_path / "jelly.usdc"
-    command = [
-        sys.executable,
-        "-m",
-        "warpfem",
-        "run",
-        str(SCENES / "jelly_drop.py"),
-        "--out",
-        str(out),
-        "--frames",
-        "2000",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    process = long_run(out, stderr=subprocess.PIPE, text=True)
     partial = tmp_path / "jelly.partial.usda"
     while process.poll() is None and not (partial.is_file() and read_animation(partial).frame_count >= 2):
         time.sleep(0.2)
