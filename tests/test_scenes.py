@@ -9,7 +9,6 @@ import pytest
 
 import warpfem as wf
 from warpfem.scene_file import load_scene
-from warpfem.simulation import body_slices
 
 SCENES = Path(__file__).parent.parent / "scenes"
 
@@ -23,7 +22,7 @@ def run(name: str, **settings) -> tuple[wf.Simulation, list[wf.Frame]]:
 
 
 def displacement(simulation: wf.Simulation, frame: wf.Frame, body: int, points: str) -> np.ndarray:
-    own, _ = body_slices(simulation.model)[body]
+    own, _ = simulation.model.body_slices[body]
     return frame.displacement[own][simulation.scene.bodies[body].mesh.select_points(points)]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warpfem.files import beside, save_arrays
-from warpfem.simulation import Simulation, body_slices
+from warpfem.simulation import Simulation
 
 
 def failure_path(output: str | Path) -> Path:
@@ -38,7 +38,7 @@ def save_failure(path: Path, simulation: Simulation, error: Exception) -> None:
         "rest_points": model.rest_points,
         "bodies": np.array([body.name for body in model.scene.bodies]),
     }
-    for index, (body, (points, _)) in enumerate(zip(model.scene.bodies, body_slices(model), strict=True)):
+    for index, (body, (points, _)) in enumerate(zip(model.scene.bodies, model.body_slices, strict=True)):
         arrays[f"cells_{index}"] = points.start + body.mesh.cells
     attempt = simulation.stepper.attempt
     if attempt is not None:

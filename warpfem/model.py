@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from math import prod
 from typing import TYPE_CHECKING, Literal
 
@@ -277,7 +278,7 @@ class Model:
             stretch[:, 1:, 0] = edges[:, 0, :]
             work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
             modulus[block.index[part]] = work / volume.numpy()[part]
-        return [float(modulus[a:b].max()) for a, b in zip(self.cell_starts, self.cell_starts[1:], strict=False)]
+        return [float(modulus[cells].max()) for _, cells in self.body_slices]
 
     def _slip_speed(self) -> float:
         """1e-3 of the speed sqrt(g L) of a fall by the smallest body's size L; without gravity, 1e-3 L per second."""
@@ -310,6 +311,12 @@ class Model:
     def zeros(self) -> wp.array:
         """A new vector of zeros per point."""
         return wp.zeros(self.point_count, dtype=self.types.vector, device=self.device)
+
+    @cached_property
+    def body_slices(self) -> list[tuple[slice, slice]]:
+        """The ranges of points and of cells of each body."""
+        points, cells = self.point_starts.tolist(), self.cell_starts.tolist()
+        return [(slice(*a), slice(*b)) for a, b in zip(pairwise(points), pairwise(cells), strict=True)]
 
     @property
     def rest_points(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from warpfem.errors import OutputError, SimulationError
 from warpfem.failure import failure_path, save_failure
 from warpfem.files import remove
 from warpfem.scene import Scene
-from warpfem.simulation import Frame, Simulation, Summary, body_slices
+from warpfem.simulation import Frame, Simulation, Summary
 
 if TYPE_CHECKING:
     from warpfem.usd import BodyFrame, UsdBody
@@ -151,7 +151,7 @@ def _body_frames(simulation: Simulation, frame: Frame) -> list[BodyFrame]:
     x = simulation.model.rest_points + frame.displacement
     return [
         BodyFrame(x[points], frame.velocity[points], frame.von_mises[cells], frame.jacobian[cells])
-        for points, cells in body_slices(simulation.model)
+        for points, cells in simulation.model.body_slices
     ]
 
 

@@ -313,7 +313,7 @@ class Simulation:
     def _warn_of_folds(self, frame: Frame) -> None:
         """Warns of bodies that had inverted cells and ended with none, but folded into themselves."""
         rest = self.model.rest_points
-        for body, (own, cells) in zip(self.scene.bodies, body_slices(self.model), strict=True):
+        for body, (own, cells) in zip(self.scene.bodies, self.model.body_slices, strict=True):
             if (frame.jacobian[cells] <= 0.0).any():
                 continue
             folded = folds(body.mesh, (rest + frame.displacement)[own])
@@ -329,7 +329,7 @@ class Simulation:
 
     def _warn_of_inverted_cells(self, jacobian: np.ndarray) -> None:
         """Warns, once for each body: the energies of most materials have other minima than the rest shape there."""
-        for body, (_, cells) in zip(self.scene.bodies, body_slices(self.model), strict=True):
+        for body, (_, cells) in zip(self.scene.bodies, self.model.body_slices, strict=True):
             inverted = np.flatnonzero(jacobian[cells] <= 0.0)
             if len(inverted) and body.name not in self._warned and not body.material.constitutive.convex:
                 self._warned.add(body.name)
@@ -345,12 +345,3 @@ class Simulation:
                     ),
                     stacklevel=2,
                 )
-
-
-def body_slices(model: Model) -> list[tuple[slice, slice]]:
-    """The ranges of points and of cells of each body of a model."""
-    points, cells = model.point_starts, model.cell_starts
-    return [
-        (slice(int(points[i]), int(points[i + 1])), slice(int(cells[i]), int(cells[i + 1])))
-        for i in range(len(model.scene.bodies))
-    ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from warpfem.dtypes import FloatName
 from warpfem.errors import WarpfemError
+from warpfem.extremes.subjects import DTYPES
 from warpfem.extremes.table import Trial
 from warpfem.materials import MATERIALS, HookeanMaterial, LinearElasticity, StableNeoHookean
 from warpfem.mesh import Mesh
@@ -25,8 +26,6 @@ EXPLICIT = (SymplecticEuler(), VelocityVerlet())
 IMPLICIT = (BackwardEuler(), BackwardEuler.linearised())
 NEWTON, LINEARISED = IMPLICIT
 VERLET = EXPLICIT[1]
-
-DTYPES: tuple[FloatName, ...] = ("float32", "float64")
 
 
 @dataclass(frozen=True)

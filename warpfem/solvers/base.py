@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import warp as wp
 
-from warpfem.errors import SimulationError
+from warpfem.errors import SceneError, SimulationError
 from warpfem.model import Model, State
 
 ROUNDING_LIMIT = 1e-2
@@ -119,6 +119,20 @@ def require_positive(dt: float) -> None:
     """Raises SimulationError unless the time step is a finite number > 0."""
     if not 0.0 < dt < np.inf:
         raise SimulationError(f"dt must be a finite number > 0, not {dt!r}")
+
+
+def require_tolerance(settings: object, name: str) -> None:
+    """Raises SceneError unless a setting is in (0, 1)."""
+    value = getattr(settings, name)
+    if not (isinstance(value, float | int) and 0.0 < value < 1.0):
+        raise SceneError(f"{type(settings).__name__}: {name} must be in (0, 1), not {value!r}")
+
+
+def require_count(settings: object, name: str, least: int) -> None:
+    """Raises SceneError unless a setting is an integer of at least ``least``."""
+    value = getattr(settings, name)
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise SceneError(f"{type(settings).__name__}: {name} must be an integer >= {least}, not {value!r}")
 
 
 def worst_cell(model: Model, u: wp.array) -> str:

@@ -18,8 +18,10 @@ from warpfem.solvers.base import (
     Solver,
     Stepper,
     StepReport,
+    require_count,
     require_finite,
     require_positive,
+    require_tolerance,
     worst_cell,
 )
 
@@ -333,9 +335,8 @@ class _BackwardEulerStepper(Stepper):
             roundings, noise = self._rounding()
             forcing = max(min(0.1, relative**0.5), 0.1 * config.tolerance / relative)
             if self._is_noise(residuals, scales, STAGNANT_ROUNDINGS * roundings if last else roundings):
-                all_is_noise = bool((scales <= 4.0 * roundings).all())
                 if last or polished == 2 or (polished and self._correction() <= ROUNDING_LIMIT):
-                    return self._rounded(solves, cg_iterations, relative, all_is_noise)
+                    return self._rounded(StepReport(solves, cg_iterations, relative), scales, roundings)
                 # noise of stiff cells may hide a force that moves the whole body, but not from one more solve
                 polished, forcing = polished + 1, POLISH
             if last:
@@ -357,7 +358,7 @@ class _BackwardEulerStepper(Stepper):
             found = self._line_search(potential, slope, noise)
             if found is None:
                 if -slope <= noise or self._is_noise(residuals, scales, STAGNANT_ROUNDINGS * roundings):
-                    return self._rounded(solves, cg_iterations, relative, bool((scales <= 4.0 * roundings).all()))
+                    return self._rounded(StepReport(solves, cg_iterations, relative), scales, roundings)
                 note = f"no step along Newton's direction lowers the potential (iteration {iteration + 1})"
                 break
             potential = found
@@ -367,14 +368,15 @@ class _BackwardEulerStepper(Stepper):
         """Whether each body's residual meets the tolerance or cannot be told from rounding."""
         return bool((residuals <= np.maximum(roundings, self.config.tolerance * scales)).all())
 
-    def _rounded(self, solves: int, cg_iterations: int, relative: float, all_is_noise: bool) -> StepReport:
+    def _rounded(self, report: StepReport, scales: np.ndarray, roundings: np.ndarray) -> StepReport:
         """The end of a step of which rounding hides the rest: good if that is little, or if no force acts at all."""
-        model = self.model
+        model, relative = self.model, report.residual
+        all_is_noise = (scales <= 4.0 * roundings).all()
         at_rest = all_is_noise and model.dead_load is None and model.contact_energy(self._u) == 0.0
         note = f"resolved only to the rounding of {model.dtype}"
         settled = relative <= SETTLED_LIMIT and self._correction() <= ROUNDING_LIMIT
-        converged = at_rest or relative <= ROUNDING_LIMIT or settled
-        return StepReport(solves, cg_iterations, relative, converged, rounded=True, note=note)
+        converged = bool(at_rest or relative <= ROUNDING_LIMIT or settled)
+        return replace(report, converged=converged, rounded=True, note=note)
 
     def _correction(self) -> float:
         """The size of the last linear solve's solution, relative to the increment."""
@@ -506,8 +508,7 @@ class _BackwardEulerStepper(Stepper):
         model = self.model
         if model.supports is not None:
             model.supports.project(vector)
-        ranges = zip(model.point_starts, model.point_starts[1:], strict=False)
-        parts = [vector[int(a) : int(b)] for a, b in ranges]
+        parts = [vector[points] for points, _ in model.body_slices]
         return np.sqrt([model.dot(part, part) for part in parts])
 
     def _linearize(self, hessian: Hessian) -> None:
@@ -578,13 +579,9 @@ class BackwardEuler(Solver):
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "linear_tolerance"):
-            value = getattr(self, name)
-            if not (isinstance(value, float | int) and 0.0 < value < 1.0):
-                raise SceneError(f"BackwardEuler: {name} must be in (0, 1), not {value!r}")
+            require_tolerance(self, name)
         for name in ("max_iterations", "linear_iterations"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise SceneError(f"BackwardEuler: {name} must be an integer >= 1, not {value!r}")
+            require_count(self, name, 1)
         for name, choices in (
             ("hessian", ("absolute", "clamped", "exact")),
             ("unconverged", ("halve", "accept")),
@@ -604,7 +601,6 @@ class BackwardEuler(Solver):
         """One linear solve a step: (M + dt^2 K(u_t)) v = M v_t + dt f(u_t) (Hu 2020, eq. 11).
 
         The K of the lecture is "exact"; "absolute" keeps steps bounded that start far from rest.
-
 
         Friction is a drag fitted to the speed of the step's start: sliding points slow down by Coulomb's law
         and sticking ones creep, but a point that comes loose takes many steps to.

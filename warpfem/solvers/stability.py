@@ -1,7 +1,5 @@
 """How large an explicit time step may be, and whether a run has outgrown it."""
 
-from itertools import pairwise
-
 import numpy as np
 import warp as wp
 
@@ -30,7 +28,7 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
     """
     corners = model.dim + 1
     largest = 0.0
-    density = np.concatenate([np.broadcast_to(body.density, body.mesh.cell_count) for body in model.scene.bodies])
+    density = _cell_densities(model)
     for block, part, stiffness in model.element_stiffness_parts(u):
         volume = block.arguments[2].numpy()[part].astype(np.float64)
         mass = density[block.index[part]] * volume / corners
@@ -44,6 +42,12 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
     if model.contact is not None:
         largest += model.contact.largest_stiffness_over_mass(model.host_mass)
     return float(np.sqrt(largest))
+
+
+def _cell_densities(model: Model) -> np.ndarray:
+    """The density of every cell, (cell_count,) [kg/m^3]."""
+    bodies = model.scene.bodies
+    return np.concatenate([np.broadcast_to(body.density, body.mesh.cell_count) for body in bodies])
 
 
 class Watch:
@@ -60,7 +64,8 @@ class Watch:
 
     def __init__(self, model: Model, state: State) -> None:
         self.model = model
-        self._densities = [self._density(block) for block in model.blocks]
+        density = _cell_densities(model)
+        self._densities = [self._device_array(density[block.index]) for block in model.blocks]
         self._square = wp.zeros(1, dtype=model.types.scalar, device=model.device)
         self._contact = 0.0 if model.contact is None else model.contact.largest_stiffness_over_mass(model.host_mass)
         self._start = model.energies(state)
@@ -69,11 +74,9 @@ class Watch:
         self._size = size
         self._proved = np.inf
 
-    def _density(self, block) -> wp.array:
-        bodies = self.model.scene.bodies
-        density = np.concatenate([np.broadcast_to(body.density, body.mesh.cell_count) for body in bodies])[block.index]
+    def _device_array(self, density: np.ndarray) -> wp.array:
         if np.ptp(density) == 0.0:
-            return uniform_array(density[:1], block.count, self.model.types.scalar, self.model.device)
+            return uniform_array(density[:1], len(density), self.model.types.scalar, self.model.device)
         return wp.array(density, dtype=self.model.types.scalar, device=self.model.device)
 
     def arrays(self) -> list[wp.array]:
@@ -123,9 +126,8 @@ class Watch:
 
     def _drift(self, velocity: np.ndarray) -> np.ndarray:
         """The mean velocity of each body, for each of its points."""
-        starts = self.model.point_starts
-        means = [velocity[a:b].mean(axis=0) for a, b in pairwise(starts)]
-        return np.repeat(means, np.diff(starts), axis=0)
+        means = [velocity[points].mean(axis=0) for points, _ in self.model.body_slices]
+        return np.repeat(means, np.diff(self.model.point_starts), axis=0)
 
     def require_bounded(self, state: State, dt: float, adaptive: bool = False) -> None:
         """Checks the state by its numbers, its energy and its speed.

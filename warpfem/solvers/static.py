@@ -10,7 +10,7 @@ from warpfem.folds import folds
 from warpfem.mesh import Mesh
 from warpfem.model import Model, State
 from warpfem.scene import Body
-from warpfem.solvers.base import StepReport, worst_cell
+from warpfem.solvers.base import StepReport, require_count, require_tolerance, worst_cell
 from warpfem.solvers.implicit import BackwardEuler, _BackwardEulerStepper
 
 
@@ -28,11 +28,8 @@ class StaticEquilibrium:
     max_iterations: int = 200
 
     def __post_init__(self) -> None:
-        number = self.max_iterations
-        if isinstance(number, bool) or not isinstance(number, int) or number < 2:
-            raise SceneError(f"StaticEquilibrium: max_iterations must be an integer >= 2, not {number!r}")
-        if not (isinstance(self.tolerance, float | int) and 0.0 < self.tolerance < 1.0):
-            raise SceneError(f"StaticEquilibrium: tolerance must be in (0, 1), not {self.tolerance!r}")
+        require_tolerance(self, "tolerance")
+        require_count(self, "max_iterations", 2)
 
     def solve(self, model: Model, state: State) -> StepReport:
         """Moves ``state`` to the equilibrium that descent from it leads to, at rest.
@@ -74,8 +71,8 @@ class StaticEquilibrium:
 
 def _require_unfolded(model: Model, displacement: np.ndarray) -> None:
     x = model.rest_points + displacement
-    for index, body in enumerate(model.scene.bodies):
-        found = folds(body.mesh, x[model.point_starts[index] : model.point_starts[index + 1]])
+    for body, (points, _) in zip(model.scene.bodies, model.body_slices, strict=True):
+        found = folds(body.mesh, x[points])
         if len(found):
             raise SimulationError(
                 f"the equilibrium that was found has body '{body.name}' folded into itself: its cells turn twice about "
@@ -157,16 +154,16 @@ def _free_modes(body: Body, points: np.ndarray, held: np.ndarray) -> list[str]:
     )
     rows = motions.transpose(0, 2, 1)[held]
     free = _null_space(rows, dim + len(turns))
-    return [_in_words(mode, origin, size, body) for mode in free]
+    return [_in_words(mode, origin, size) for mode in free]
 
 
 def _held(model: Model, index: int) -> tuple[np.ndarray, np.ndarray]:
     """The held points of a body, by their numbers in its mesh, and which of their components (k, dim) bool."""
     if model.supports is None:
         return np.empty(0, dtype=np.int64), np.empty((0, model.dim), dtype=bool)
-    points = model.supports.host_points
-    own = (points >= model.point_starts[index]) & (points < model.point_starts[index + 1])
-    return points[own] - model.point_starts[index], model.supports.held.numpy()[own] > 0.0
+    points, (body, _) = model.supports.host_points, model.body_slices[index]
+    own = (points >= body.start) & (points < body.stop)
+    return points[own] - body.start, model.supports.held.numpy()[own] > 0.0
 
 
 def _turns(dim: int) -> np.ndarray:
@@ -202,8 +199,8 @@ def _null_space(rows: np.ndarray, count: int) -> np.ndarray:
     return basis
 
 
-def _in_words(mode: np.ndarray, origin: np.ndarray, size: float, body: Body) -> str:
-    dim = body.mesh.dim
+def _in_words(mode: np.ndarray, origin: np.ndarray, size: float) -> str:
+    dim = len(origin)
     shift, turn = mode[:dim], mode[dim:] / size
     if np.abs(turn).max() * size < 1e-9:
         return f"translation along {_direction(shift)}"

@@ -75,7 +75,7 @@ class ChunkedLayer:
             Sdf.JustCreatePrimAttributeInLayer(self._manifest, path, type_name)
 
         if not kept or any(chunk.path.parent != self._folder for chunk in kept):
-            self._remove()
+            self.discard()
             self._folder.mkdir(parents=True)
         self._chunks = [self._adopt(chunk) for chunk in kept]
         self.frame_count = sum(len(chunk.frames) for chunk in kept)
@@ -141,7 +141,7 @@ class ChunkedLayer:
         finally:
             merged.unlink(missing_ok=True)
             text.unlink(missing_ok=True)
-        self._remove()
+        self.discard()
 
     def _write_merged(self, path: Path, metadata: dict[str, Any], amend: Callable[[Samples], Samples]) -> None:
         merged = Sdf.Layer.CreateNew(str(path))
@@ -190,10 +190,7 @@ class ChunkedLayer:
         Sdf.CreatePrimInLayer(layer, WORLD).SetInfo("customData", metadata)
 
     def discard(self) -> None:
-        """Removes the partial file."""
-        self._remove()
-
-    def _remove(self) -> None:
+        """Removes the partial file, with its folder."""
         remove(self.path)
         if self._folder.exists():
             shutil.rmtree(self._folder)
