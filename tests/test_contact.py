@@ -543,3 +543,14 @@ def test_a_linearised_step_into_contact_says_so():
     assert model.energies(state).total > before  # it did not see the floor
     assert not report.converged
     assert "above the potential of standing still" in report.note
+
+
+def test_a_body_that_gives_way_does_not_creep_round_a_sphere_within_a_step():
+    """Newton's method finds the way round if the body is soft: in such long steps the far side has less potential."""
+    mesh = Mesh.rectangle((0.4, 0.4), (3, 3), (-0.2, 0.1))
+    body = Body("jelly", mesh, StableNeoHookean(E=1e5, nu=0.3), velocity=(0.0, -100.0))
+    model, state, stepper = ready(Scene([body], BackwardEuler(), obstacles=[Sphere((0.0, -1.0), 1.0)]), "float32")
+    report = stepper.step(state, 1.0 / 24.0)
+    x = model.rest_points + state.displacement
+    assert report.parts > 1
+    assert not ((x[:, 1] < -1.0) & (np.abs(x[:, 0]) < 1.0)).any()
