@@ -259,11 +259,9 @@ class Samples:
     def energy_density(self) -> np.ndarray:
         """(n,) float64: one launch per cell, because the kernel adds up."""
         (block,) = self.model.blocks
-        cells, *constants = block.arguments
         energy = wp.zeros(len(self.F), dtype=wp.float64, device=self.model.device)
         for i in range(len(self.F)):
-            arguments = [cells[i : i + 1], *constants, self.state.u]
-            wp.launch(block.kernels.energy, 1, arguments, [energy[i : i + 1]], device=self.model.device)
+            block.launch("energy", [self.state.u], [energy[i : i + 1]], part=slice(i, i + 1))
         return energy.numpy() / self.volume
 
     @cached_property

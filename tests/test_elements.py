@@ -7,6 +7,7 @@ from helpers import REFERENCES, custom_neo_hookean, irregular_mesh, model_of, ra
 from warpfem.elements import element_kernels
 from warpfem.materials import MATERIALS, Material
 from warpfem.model import Model, State
+from warpfem.shapes import shape
 
 E, NU = 2.0e5, 0.35
 CUSTOM = "psi alone"
@@ -208,9 +209,9 @@ def test_affine_patch(name, dim):
 
 
 def test_kernels_are_made_once_and_on_request():
-    kernels = element_kernels(MATERIALS["linear"].functions, 2, "float64")
-    assert element_kernels(MATERIALS["linear"].functions, 2, "float64") is kernels
-    assert element_kernels(MATERIALS["linear"].functions, 2, "float32") is not kernels
+    kernels = element_kernels(MATERIALS["linear"].functions, shape(2, 1), "float64")
+    assert element_kernels(MATERIALS["linear"].functions, shape(2, 1), "float64") is kernels
+    assert element_kernels(MATERIALS["linear"].functions, shape(2, 1), "float32") is not kernels
     assert kernels.energy is kernels.energy
-    fresh = type(kernels)(MATERIALS["linear"].functions, 2, "float64")
+    fresh = type(kernels)(MATERIALS["linear"].functions, shape(2, 1), "float64")
     assert not {"energy", "force", "differential", "stiffness", "stress"} & set(vars(fresh))

@@ -8,7 +8,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "warpfem"
 
 LAYERS = [
-    {"errors"},
+    {"errors", "shapes"},
     {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child"},
     {"mesh", "points"},
     {"materials"},

@@ -178,12 +178,13 @@ def test_a_plane_of_constant_z_is_2d(tmp_path):
     ("cells", "message"),
     [
         ([("triangle", [[0, 1, 2], [0, 1, 3]])], r"constant z: they are a surface; .*tetrahedralize"),
-        ([("tetra10", [range(10)])], "1 cells of type 'tetra10': only linear"),
+        ([("tetra20", [[*range(10), *range(10)]])], "1 cells of type 'tetra20': only triangles"),
+        ([("tetra", [[0, 1, 2, 3]]), ("tetra10", [range(10)])], "mixes cells of types tetra and tetra10"),
         (
             [("tetra", [[0, 1, 2, 3]]), ("hexahedron", [range(8)])],
-            "1 cells of type 'hexahedron': only linear",
+            "1 cells of type 'hexahedron': only triangles",
         ),
-        ([("quad", [[0, 1, 2, 4]])], "1 cells of type 'quad': only linear"),
+        ([("quad", [[0, 1, 2, 4]])], "1 cells of type 'quad': only triangles"),
         ([("line", [[0, 1]])], "no triangles or tetrahedra"),
         ([("tetra", [[0, 1, 2, 3]] * 2)], "cell 1 has the same points as cell 0"),
         ([("tetra", [[0, 1, 2, 77]])], "cell 0 refers to a point outside"),

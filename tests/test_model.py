@@ -107,11 +107,11 @@ def test_numbering_runs_through_the_bodies():
 
 def test_uniform_parameters_are_stored_once():
     """An array of stride 0: 8 bytes for any number of cells."""
-    uniform = model_of(SOFT, square(5), "float32").blocks[0].arguments[3]
+    uniform = model_of(SOFT, square(5), "float32").blocks[0].arguments["parameters"]
     assert uniform.shape == (50,)
     assert uniform.strides == (0,)
     assert device_bytes([uniform]) == 8
-    per_cell = model_of(StableNeoHookean(np.full(50, 1e4), 0.4), square(5), "float32").blocks[0].arguments[3]
+    per_cell = model_of(StableNeoHookean(np.full(50, 1e4), 0.4), square(5), "float32").blocks[0].arguments["parameters"]
     assert device_bytes([per_cell]) == 50 * 8
     np.testing.assert_array_equal(uniform.numpy(), per_cell.numpy())
 
@@ -435,7 +435,7 @@ def test_parameters_of_bodies_that_share_kernels(rng):
     young = rng.uniform(1e4, 1e5, mesh.cell_count)
     scene = scene_of(Body("uniform", mesh, SOFT), Body("graded", mesh, StableNeoHookean(young, 0.4)))
     (cells,) = Model(scene, dtype="float64").blocks
-    parameters = cells.arguments[3].numpy()
+    parameters = cells.arguments["parameters"].numpy()
     mu = np.concatenate([np.full(mesh.cell_count, 1e4), young]) / 2.8
     np.testing.assert_allclose(parameters[:, 0], 4.0 / 3.0 * mu, rtol=1e-14)
 

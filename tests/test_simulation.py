@@ -222,7 +222,7 @@ print(sorted(heavy & set(sys.modules)))
 def test_device_bytes_count_a_uniform_array_once():
     scene = cube(frames=1)
     model = wf.Model(scene)
-    parameters = model.blocks[0].arguments[3]
+    parameters = model.blocks[0].arguments["parameters"]
     assert parameters.shape == (5,)
     assert device_bytes([parameters]) == 2 * 4
     assert device_bytes([model.mass]) == 8 * 4

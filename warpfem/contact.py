@@ -331,15 +331,17 @@ def _bearing_areas(mesh: Mesh) -> np.ndarray:
     """The area with which each boundary point bears on an obstacle, (k,) [m^2].
 
     It is the largest that the point's share of its faces projects to along any of their normals: on a smooth
-    surface the share itself, on the rim of a flat base that of the base without the sides.
+    surface the share itself, on the rim of a flat base that of the base without the sides. Faces are shared as mass
+    is: the corners of quadratic ones, to which a uniform pressure gives no force, must bear something too.
     """
+    shares = np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares).ravel()
     corners = mesh.boundary_faces.ravel()
     order = np.argsort(corners, kind="stable")
     _, starts, counts = np.unique(corners[order], return_index=True, return_counts=True)
     columns = np.arange(counts.max())
-    faces = order[np.minimum(starts[:, None] + columns, len(order) - 1)] // mesh.dim
-    areas = np.where(columns < counts[:, None], mesh.boundary_face_areas[faces] / mesh.dim, 0.0)
-    normals = mesh.boundary_face_normals[faces]
+    slots = order[np.minimum(starts[:, None] + columns, len(order) - 1)]
+    areas = np.where(columns < counts[:, None], shares[slots], 0.0)
+    normals = mesh.boundary_face_normals[slots // mesh.boundary_faces.shape[1]]
     cosines = np.einsum("kid,kjd->kij", normals, normals)
     return np.einsum("kij,kj->ki", np.maximum(cosines, 0.0), areas).max(axis=1, where=areas > 0.0, initial=0.0)
 

@@ -21,7 +21,6 @@ class Types:
         scalar: ``wp.float32`` or ``wp.float64``.
         vector: vector of length ``dim``.
         matrix: ``dim`` x ``dim`` matrix.
-        cell: vector of ``dim + 1`` int32, the points of a simplex.
         numpy: the NumPy scalar type.
     """
 
@@ -29,7 +28,6 @@ class Types:
     scalar: type
     vector: type
     matrix: type
-    cell: type
     numpy: type
 
     @property
@@ -56,7 +54,6 @@ def types(dim: int, dtype: str) -> Types:
         scalar=scalar,
         vector=wp.types.vector(length=dim, dtype=scalar),
         matrix=wp.types.matrix(shape=(dim, dim), dtype=scalar),
-        cell=wp.types.vector(length=dim + 1, dtype=wp.int32),
         numpy=np.float32 if dtype == "float32" else np.float64,
     )
 

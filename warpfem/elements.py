@@ -1,9 +1,13 @@
-"""Linear simplex elements: the kernels of energy, force, force differential, stiffness and stress.
+"""Simplex elements, linear and quadratic: the kernels of energy, force, force differential, stiffness and stress.
 
-A cell with rest shape matrix D_m has the constant displacement gradient H = sum_k (u_k - u_0) b_k^T, where
-b_k is row k of B = D_m^-1, the gradient of the k-th shape function; F = I + H (Hu 2020; Sifakis and Barbic
-2012). Kernels take the cells' data as ``cells, inverse_shape, volume, parameters`` and exist, each in a
-module of its own, only once something asks for them.
+The displacement gradient is H = sum_k (u_k - u_0) g_k^T, where g_k is the gradient of the k-th shape function;
+F = I + H (Hu 2020; Sifakis and Barbic 2012). In a linear cell g_k is constant, row k of B = D_m^-1. In a quadratic one
+it is taken at each of the dim + 1 quadrature points, for which rows of B are the gradients of the barycentric
+coordinates.
+
+Kernels run over quadrature points, of which a linear cell has one. They take the cells' data as ``cells, parameters``
+(one entry for each cell) and ``inverse_shape, volume`` (one for each quadrature point) and exist, each in a module of
+its own, only once something asks for them.
 """
 
 import functools
@@ -13,6 +17,7 @@ import warp as wp
 
 from warpfem.dtypes import types
 from warpfem.materials.base import Constitutive
+from warpfem.shapes import Shape
 from warpfem.tensor import (
     cofactor,
     deformation_gradient,
@@ -44,34 +49,77 @@ _FILTERS = {"absolute": _absolute, "clamped": _clamped}
 
 
 class ElementKernels:
-    """The kernels for one material, dimension and precision, each made on first use."""
+    """The kernels for one material, shape and precision, each made on first use."""
 
-    def __init__(self, constitutive: Constitutive, dim: int, dtype: str) -> None:
+    def __init__(self, constitutive: Constitutive, shape: Shape, dtype: str) -> None:
         self.constitutive = constitutive
-        self.dim = dim
+        self.shape = shape
+        self.dim = dim = shape.dim
         self.types = types(dim, dtype)
-        scalar, vector, matrix, cell_type = (
-            self.types.scalar,
-            self.types.vector,
-            self.types.matrix,
-            self.types.cell,
-        )
+        scalar, vector, matrix = self.types.scalar, self.types.vector, self.types.matrix
+        self.cell_type = cell_type = wp.types.vector(length=shape.point_count, dtype=wp.int32)
         self.parameter_vector = wp.types.vector(length=constitutive.parameter_count, dtype=scalar)
+        others = shape.point_count - 1
+        gradients_type = wp.types.matrix(shape=(others, dim), dtype=scalar)
+
+        if shape.order == 1:
+
+            @wp.func
+            def shape_gradients(B: matrix, place: int):
+                return B
+
+        else:
+            near, far = shape.quadrature_places[0][:2].tolist()
+            first_corner = wp.types.vector(length=len(shape.edges), dtype=wp.int32)(*shape.edges[:, 0].tolist())
+            second_corner = wp.types.vector(length=len(shape.edges), dtype=wp.int32)(*shape.edges[:, 1].tolist())
+            corners_type = wp.types.matrix(shape=(dim + 1, dim), dtype=scalar)
+            places_type = wp.types.vector(length=dim + 1, dtype=scalar)
+
+            @wp.func
+            def shape_gradients(B: matrix, place: int):
+                directions = corners_type()  # the gradients of the barycentric coordinates
+                for k in range(dim):
+                    directions[k + 1] = B[k]
+                    directions[0] = directions[0] - B[k]
+                weight = places_type(scalar(far))
+                weight[place] = scalar(near)
+                four = scalar(4.0)
+                result = gradients_type()
+                for k in range(dim):
+                    result[k] = (four * weight[k + 1] - scalar(1.0)) * B[k]
+                for k in range(wp.static(len(shape.edges))):
+                    a = wp.static(first_corner)[k]
+                    b = wp.static(second_corner)[k]
+                    result[dim + k] = four * (weight[a] * directions[b] + weight[b] * directions[a])
+                return result
 
         @wp.func
-        def displacement_gradient(u: wp.array(dtype=vector), cell: cell_type, B: matrix):
+        def displacement_gradient(u: wp.array(dtype=vector), cell: cell_type, gradients: gradients_type):
             origin = u[cell[0]]
-            H = wp.outer(u[cell[1]] - origin, B[0])
-            for k in range(1, dim):
-                H += wp.outer(u[cell[k + 1]] - origin, B[k])
+            H = wp.outer(u[cell[1]] - origin, gradients[0])
+            for k in range(1, others):
+                H += wp.outer(u[cell[k + 1]] - origin, gradients[k])
             return H
+
+        @wp.func
+        def add_divergence(
+            cell: cell_type, gradients: gradients_type, weighted: matrix, force_out: wp.array(dtype=vector)
+        ):
+            total = vector()
+            for k in range(others):
+                f = weighted * gradients[k]
+                total += f
+                wp.atomic_add(force_out, cell[k + 1], f)
+            wp.atomic_add(force_out, cell[0], -total)
 
         @wp.func
         def add_block(blocks: wp.array(dtype=matrix), slot: int, block: matrix):
             if slot >= 0:
                 wp.atomic_add(blocks, slot, block)
 
+        self._shape_gradients = shape_gradients
         self._displacement_gradient = displacement_gradient
+        self._add_divergence = add_divergence
         self._add_block = add_block
 
     @functools.cached_property
@@ -79,7 +127,8 @@ class ElementKernels:
         """Adds the volume-weighted energy of each cell to ``energy_out[0]`` (float64)."""
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places = self.shape.quadrature_count
         energy_density = self.constitutive.energy_density
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -92,17 +141,19 @@ class ElementKernels:
             energy_out: wp.array(dtype=wp.float64),
         ):
             i = wp.tid()
-            H = displacement_gradient(u, cells[i], inverse_shape[i])
-            wp.atomic_add(energy_out, 0, wp.float64(volume[i] * energy_density(H, parameters[i])))
+            c = i // places
+            H = displacement_gradient(u, cells[c], shape_gradients(inverse_shape[i], i % places))
+            wp.atomic_add(energy_out, 0, wp.float64(volume[i] * energy_density(H, parameters[c])))
 
         return element_energy
 
     @functools.cached_property
     def density(self) -> wp.Kernel:
-        """Writes the energy density psi of each cell."""
+        """Writes the energy density psi at each quadrature point."""
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places = self.shape.quadrature_count
         energy_density = self.constitutive.energy_density
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -114,8 +165,9 @@ class ElementKernels:
             density_out: wp.array(dtype=scalar),
         ):
             i = wp.tid()
-            H = displacement_gradient(u, cells[i], inverse_shape[i])
-            density_out[i] = energy_density(H, parameters[i])
+            c = i // places
+            H = displacement_gradient(u, cells[c], shape_gradients(inverse_shape[i], i % places))
+            density_out[i] = energy_density(H, parameters[c])
 
         return element_density
 
@@ -132,10 +184,11 @@ class ElementKernels:
         return self._force_kernel(enable_backward=True)
 
     def _force_kernel(self, enable_backward: bool) -> wp.Kernel:
-        dim = self.dim
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        add_divergence = self._add_divergence
+        places = self.shape.quadrature_count
         stress = self.constitutive.stress
 
         @wp.kernel(module="unique", enable_backward=enable_backward)
@@ -148,16 +201,11 @@ class ElementKernels:
             force_out: wp.array(dtype=vector),
         ):
             i = wp.tid()
-            cell = cells[i]
-            B = inverse_shape[i]
-            H = displacement_gradient(u, cell, B)
-            weighted = -volume[i] * stress(H, parameters[i])
-            total = vector()
-            for k in range(dim):
-                f = weighted * B[k]
-                total += f
-                wp.atomic_add(force_out, cell[k + 1], f)
-            wp.atomic_add(force_out, cell[0], -total)
+            c = i // places
+            cell = cells[c]
+            gradients = shape_gradients(inverse_shape[i], i % places)
+            H = displacement_gradient(u, cell, gradients)
+            add_divergence(cell, gradients, -volume[i] * stress(H, parameters[c]), force_out)
 
         return element_force
 
@@ -177,10 +225,11 @@ class ElementKernels:
         return self._differential_kernel(self._filtered_rule("absolute")) if self._filterable else self.differential
 
     def _differential_kernel(self, rule: tuple) -> wp.Kernel:
-        dim = self.dim
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        add_divergence = self._add_divergence
+        places = self.shape.quadrature_count
         tangent, apply = rule
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -194,23 +243,19 @@ class ElementKernels:
             product_out: wp.array(dtype=vector),
         ):
             i = wp.tid()
-            cell = cells[i]
-            B = inverse_shape[i]
-            H = displacement_gradient(u, cell, B)
-            dH = displacement_gradient(p, cell, B)
-            weighted = volume[i] * apply(tangent(H, parameters[i]), dH, parameters[i])
-            total = vector()
-            for k in range(dim):
-                f = weighted * B[k]
-                total += f
-                wp.atomic_add(product_out, cell[k + 1], f)
-            wp.atomic_add(product_out, cell[0], -total)
+            c = i // places
+            cell = cells[c]
+            gradients = shape_gradients(inverse_shape[i], i % places)
+            H = displacement_gradient(u, cell, gradients)
+            dH = displacement_gradient(p, cell, gradients)
+            dP = apply(tangent(H, parameters[c]), dH, parameters[c])
+            add_divergence(cell, gradients, volume[i] * dP, product_out)
 
         return element_differential
 
     @functools.cached_property
     def stiffness(self) -> wp.Kernel:
-        """Adds the d x d blocks K_ab of each cell's tangent stiffness to ``blocks_out[slots[i, a, b]]``.
+        """Adds the d x d blocks K_ab of each cell's tangent stiffness to ``blocks_out[slots[cell, a, b]]``.
 
         A block whose slot is negative is left out.
         """
@@ -231,7 +276,9 @@ class ElementKernels:
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         add_block = self._add_block
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places = self.shape.quadrature_count
+        others = self.shape.point_count - 1
         stress_differential = self.constitutive.stress_differential
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -245,23 +292,25 @@ class ElementKernels:
             blocks_out: wp.array(dtype=matrix),
         ):
             i = wp.tid()
-            B = inverse_shape[i]
-            p = parameters[i]
-            H = displacement_gradient(u, cells[i], B)
-            count = int(dim)
-            for b in range(count):  # the columns of shape function b + 1, of component c
+            c = i // places
+            gradients = shape_gradients(inverse_shape[i], i % places)
+            p = parameters[c]
+            H = displacement_gradient(u, cells[c], gradients)
+            components = int(dim)
+            count = int(others)
+            for b in range(count):  # the columns of shape function b + 1, of component k
                 column_sum = matrix()
-                for c in range(count):
+                for k in range(components):
                     axis = vector()
-                    axis[c] = scalar(1.0)
-                    dP = volume[i] * stress_differential(H, wp.outer(axis, B[b]), p)
+                    axis[k] = scalar(1.0)
+                    dP = volume[i] * stress_differential(H, wp.outer(axis, gradients[b]), p)
                     for a in range(count):
-                        block = wp.outer(dP * B[a], axis)
+                        block = wp.outer(dP * gradients[a], axis)
                         column_sum += block
-                        add_block(blocks_out, slots[i, a + 1, b + 1], block)
-                        add_block(blocks_out, slots[i, a + 1, 0], -block)
-                add_block(blocks_out, slots[i, 0, b + 1], -column_sum)
-                add_block(blocks_out, slots[i, 0, 0], column_sum)
+                        add_block(blocks_out, slots[c, a + 1, b + 1], block)
+                        add_block(blocks_out, slots[c, a + 1, 0], -block)
+                add_block(blocks_out, slots[c, 0, b + 1], -column_sum)
+                add_block(blocks_out, slots[c, 0, 0], column_sum)
 
         return element_stiffness
 
@@ -270,9 +319,11 @@ class ElementKernels:
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         add_block = self._add_block
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places = self.shape.quadrature_count
         tangent, _apply = self._filtered_rule(kind)
-        gradients_type = wp.types.matrix(shape=(dim + 1, dim), dtype=scalar)
+        point_count = self.shape.point_count
+        gradients_type = wp.types.matrix(shape=(point_count, dim), dtype=scalar)
 
         @wp.kernel(module="unique", enable_backward=False)
         def filtered_element_stiffness(
@@ -285,25 +336,26 @@ class ElementKernels:
             blocks_out: wp.array(dtype=matrix),
         ):
             i = wp.tid()
-            B = inverse_shape[i]
-            t = tangent(displacement_gradient(u, cells[i], B), parameters[i])
+            c = i // places
+            rest_gradients = shape_gradients(inverse_shape[i], i % places)
+            t = tangent(displacement_gradient(u, cells[c], rest_gradients), parameters[c])
             gradients = gradients_type()  # of the shape functions, in the principal axes of C
-            for k in range(dim):
-                g = B[k] * t.V
+            for k in range(wp.static(point_count - 1)):
+                g = rest_gradients[k] * t.V
                 gradients[k + 1] = g
                 gradients[0] = gradients[0] - g
-            corners = int(dim + 1)
-            for a in range(corners):
+            count = int(point_count)
+            for a in range(count):
                 g = gradients[a]
-                for b in range(a, corners):
+                for b in range(a, count):
                     h = gradients[b]
                     # K_ab in the principal axes: entry (m, n) is the sum over j, l of dP_mj/dF_nl g_j h_l
                     K = wp.cw_mul(t.stretch, wp.outer(g, h)) + wp.cw_mul(t.swapped, wp.outer(h, g))
                     K += wp.diag(t.same * wp.cw_mul(g, h))
                     block = volume[i] * (t.U * K * wp.transpose(t.U))
-                    add_block(blocks_out, slots[i, a, b], block)
+                    add_block(blocks_out, slots[c, a, b], block)
                     if b > a:
-                        add_block(blocks_out, slots[i, b, a], wp.transpose(block))
+                        add_block(blocks_out, slots[c, b, a], wp.transpose(block))
 
         return filtered_element_stiffness
 
@@ -311,9 +363,12 @@ class ElementKernels:
     def frequency(self) -> wp.Kernel:
         """Raises ``square_out[0]`` to an estimate of the largest squared frequency of each cell alone [1/s^2].
 
-        By power iteration on the change of H: with lumped mass it is G -> (d + 1)/rho dP(G) sum_a b_a b_a^T. It
-        starts along the shortest height of the cell, where most cells are stiffest.
+        It runs over cells. By power iteration, which starts where most cells are stiffest.
         """
+        return self._linear_frequency() if self.shape.order == 1 else self._quadratic_frequency()
+
+    def _linear_frequency(self) -> wp.Kernel:
+        """On the change of H, with lumped mass G -> (d + 1)/rho dP(G) sum_a b_a b_a^T, from the shortest height."""
         dim = self.dim
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
@@ -357,6 +412,73 @@ class ElementKernels:
 
         return element_frequency
 
+    def _quadratic_frequency(self) -> wp.Kernel:
+        """On displacements M^-1/2 p of the points: p -> M^-1/2 K M^-1/2 p, from the shape functions' gradients."""
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places, point_count = self.shape.quadrature_count, self.shape.point_count
+        corner_share, middle_share = self.shape.mass_shares[[0, -1]].tolist()
+        stress_differential = self.constitutive.stress_differential
+        displacements = wp.types.matrix(shape=(point_count, dim), dtype=scalar)
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_frequency(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            volume: wp.array(dtype=scalar),
+            parameters: wp.array(dtype=parameter_vector),
+            density: wp.array(dtype=scalar),
+            u: wp.array(dtype=vector),
+            square_out: wp.array(dtype=scalar),
+        ):
+            c = wp.tid()
+            count = int(places)
+            others = int(point_count - 1)
+            mass = scalar(0.0)
+            p = displacements()
+            for place in range(count):
+                i = places * c + place
+                mass += density[c] * volume[i]
+                gradients = shape_gradients(inverse_shape[i], place)
+                F = deformation_gradient(displacement_gradient(u, cells[c], gradients))
+                for a in range(others):
+                    p[a + 1] += F * gradients[a]
+                    p[0] = p[0] - F * gradients[a]
+            corner_root = wp.sqrt(scalar(corner_share) * mass)
+            middle_root = wp.sqrt(scalar(middle_share) * mass)
+            square = scalar(0.0)
+            rounds = int(6)
+            for _round in range(rounds):
+                p = p / wp.sqrt(wp.ddot(p, p))
+                for a in range(wp.static(dim + 1)):
+                    p[a] = p[a] / corner_root
+                for a in range(wp.static(dim + 1), point_count):
+                    p[a] = p[a] / middle_root
+                force = displacements()
+                for place in range(count):
+                    i = places * c + place
+                    gradients = shape_gradients(inverse_shape[i], place)
+                    H = displacement_gradient(u, cells[c], gradients)
+                    dH = matrix()
+                    for a in range(others):
+                        dH += wp.outer(p[a + 1] - p[0], gradients[a])
+                    weighted = volume[i] * stress_differential(H, dH, parameters[c])
+                    for a in range(others):
+                        force[a + 1] += weighted * gradients[a]
+                        force[0] = force[0] - weighted * gradients[a]
+                for a in range(wp.static(dim + 1)):
+                    p[a] = force[a] / corner_root
+                for a in range(wp.static(dim + 1), point_count):
+                    p[a] = force[a] / middle_root
+                square = wp.sqrt(wp.ddot(p, p))
+            if not (square < scalar(wp.static(_LARGE))):
+                square = scalar(wp.static(_LARGE))
+            wp.atomic_max(square_out, 0, square)
+
+        return element_frequency
+
     @functools.cached_property
     def step_limit(self) -> wp.Kernel:
         """Lowers ``limit_out[0]`` to the least s > 0 at which u + s p takes a cell to J = 0.
@@ -366,7 +488,8 @@ class ElementKernels:
         """
         dim = self.dim
         scalar, vector, matrix, cell_type = self._types
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places = self.shape.quadrature_count
 
         @wp.func
         def cubic_part(dH: matrix):
@@ -390,9 +513,10 @@ class ElementKernels:
         ):
             i = wp.tid()
             zero = scalar(0.0)
-            cell = cells[i]
-            H = displacement_gradient(u, cell, inverse_shape[i])
-            dH = displacement_gradient(p, cell, inverse_shape[i])
+            cell = cells[i // places]
+            gradients = shape_gradients(inverse_shape[i], i % places)
+            H = displacement_gradient(u, cell, gradients)
+            dH = displacement_gradient(p, cell, gradients)
             c3 = wp.min(cubic_part(dH), zero)
             s = zero
             searching = bool(True)
@@ -425,10 +549,11 @@ class ElementKernels:
 
     @functools.cached_property
     def stress(self) -> wp.Kernel:
-        """Writes the 3x3 first Piola-Kirchhoff stress of each cell (plane strain: with the normal stress)."""
+        """Writes the 3x3 first Piola-Kirchhoff stress at each quadrature point (plane strain: with the normal one)."""
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places = self.shape.quadrature_count
         solid_stress = self._solid_stress()
         solid = wp.types.matrix(shape=(3, 3), dtype=scalar)
 
@@ -441,17 +566,19 @@ class ElementKernels:
             stress_out: wp.array(dtype=solid),
         ):
             i = wp.tid()
-            H = displacement_gradient(u, cells[i], inverse_shape[i])
-            stress_out[i] = solid_stress(H, parameters[i])
+            c = i // places
+            H = displacement_gradient(u, cells[c], shape_gradients(inverse_shape[i], i % places))
+            stress_out[i] = solid_stress(H, parameters[c])
 
         return element_stress
 
     @functools.cached_property
     def diagnostics(self) -> wp.Kernel:
-        """Writes J and the von Mises stress sqrt(3/2) |dev tau| / |J| of each cell, with |J| at least 1e-6."""
+        """Writes J and the von Mises stress sqrt(3/2) |dev tau| / |J| at each quadrature point, |J| at least 1e-6."""
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
-        displacement_gradient = self._displacement_gradient
+        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
+        places = self.shape.quadrature_count
         solid_stress = self._solid_stress()
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -464,10 +591,11 @@ class ElementKernels:
             von_mises_out: wp.array(dtype=scalar),
         ):
             i = wp.tid()
-            plane = displacement_gradient(u, cells[i], inverse_shape[i])
+            c = i // places
+            plane = displacement_gradient(u, cells[c], shape_gradients(inverse_shape[i], i % places))
             H = embed(plane)
             J = scalar(1.0) + volume_change(H)
-            kirchhoff = solid_stress(plane, parameters[i]) * wp.transpose(deformation_gradient(H))
+            kirchhoff = solid_stress(plane, parameters[c]) * wp.transpose(deformation_gradient(H))
             deviator = kirchhoff - (wp.trace(kirchhoff) / scalar(3.0)) * identity_like(H)
             jacobian_out[i] = J
             von_mises_out[i] = wp.sqrt(scalar(1.5) * wp.ddot(deviator, deviator)) / wp.max(wp.abs(J), scalar(1.0e-6))
@@ -498,7 +626,7 @@ class ElementKernels:
 
     @property
     def _types(self) -> tuple:
-        return self.types.scalar, self.types.vector, self.types.matrix, self.types.cell
+        return self.types.scalar, self.types.vector, self.types.matrix, self.cell_type
 
     # A rule is a pair of functions: tangent(H, parameters) does what depends on the state alone,
     # apply(tangent, dH, parameters) gives dP.
@@ -591,6 +719,6 @@ class ElementKernels:
 
 
 @functools.cache
-def element_kernels(constitutive: Constitutive, dim: int, dtype: str) -> ElementKernels:
-    """The kernels of a material for ``dim`` 2 or 3 and ``dtype`` "float32" or "float64"; cached."""
-    return ElementKernels(constitutive, dim, dtype)
+def element_kernels(constitutive: Constitutive, shape: Shape, dtype: str) -> ElementKernels:
+    """The kernels of a material for cells of a shape and ``dtype`` "float32" or "float64"; cached."""
+    return ElementKernels(constitutive, shape, dtype)

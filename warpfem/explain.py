@@ -126,12 +126,12 @@ def _terms(simulation: Simulation) -> list[Term]:
     scene, model = simulation.scene, simulation.model
     cells: Counter[str] = Counter()
     for body in scene.bodies:
-        cells[body.material.name] += body.mesh.cell_count
+        cells[f"{body.material.name} ({{}} {body.element} cells)"] += body.mesh.cell_count
     loads = [load for body in scene.bodies for load in body.loads]
     kinds = Counter(type(obstacle).__name__ for obstacle in scene.obstacles)
     frictions = sorted({obstacle.friction for obstacle in scene.obstacles if obstacle.friction > 0.0})
     return [
-        Term("elasticity", True, ", ".join(f"{name} ({count} cells)" for name, count in cells.items())),
+        Term("elasticity", True, ", ".join(text.format(count) for text, count in cells.items())),
         Term(
             "gravity",
             scene.gravity is not None,

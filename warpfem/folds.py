@@ -24,20 +24,20 @@ def folds(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     Returns:
         Point numbers, (k, 2) of the ends of edges in 3D or (k, 1) in 2D.
     """
-    corners = mesh.dim + 1
+    corners, cells = mesh.dim + 1, mesh.linear_cells
     hinges, angles = [], []
     for hinge in combinations(range(corners), mesh.dim - 1):
-        first, second = (points[mesh.cells[:, k]] for k in range(corners) if k not in hinge)
-        origin = points[mesh.cells[:, hinge[0]]]
+        first, second = (points[cells[:, k]] for k in range(corners) if k not in hinge)
+        origin = points[cells[:, hinge[0]]]
         first, second = first - origin, second - origin
         if len(hinge) == 2:
-            axis = points[mesh.cells[:, hinge[1]]] - origin
+            axis = points[cells[:, hinge[1]]] - origin
             first, second = _across(first, axis), _across(second, axis)
-        hinges.append(np.sort(mesh.cells[:, hinge], axis=1))
+        hinges.append(np.sort(cells[:, hinge], axis=1))
         angles.append(_angle(first, second))
     unique, inverse = np.unique(np.concatenate(hinges), axis=0, return_inverse=True)
     turns = np.bincount(inverse.ravel(), np.concatenate(angles)) / (2.0 * np.pi)
-    faces = mesh.boundary_faces
+    faces = mesh.linear_boundary_faces
     outer = np.concatenate([np.sort(faces[:, hinge], axis=1) for hinge in combinations(range(mesh.dim), mesh.dim - 1)])
     inner = ~np.isin(_keys(unique, mesh.point_count), _keys(outer, mesh.point_count))
     return unique[inner & (turns > 1.5)]

@@ -354,9 +354,10 @@ class _UnassembledOperator(TangentOperator):
     @functools.cached_property
     def _diagonal_blocks(self) -> tuple[wp.array, list[wp.array], wp.array]:
         # the elements' kernel leaves out the blocks whose slot is negative
-        n, corners = self.model.point_count, self.model.dim + 1
+        n = self.model.point_count
         slots = []
         for block in self.model.blocks:
+            corners = block.shape.point_count
             own = np.full((block.count, corners, corners), -1, dtype=np.int32)
             own[:, range(corners), range(corners)] = block.host_cells
             slots.append(self._indices(own))
@@ -466,12 +467,12 @@ def tangent_operator(model: Model, route: Route, *, external: bool = True) -> Ta
 
 def _block_pattern(model: Model) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Compressed rows of all pairs of points that share a cell, and each cell's places in them."""
-    n, corners = model.point_count, model.dim + 1
+    n = model.point_count
     pairs = [block.host_cells.astype(np.int64)[:, :, None] * n + block.host_cells[:, None, :] for block in model.blocks]
     keys, places = np.unique(np.concatenate([own.ravel() for own in pairs]), return_inverse=True)
     row_starts = np.searchsorted(keys, np.arange(n + 1, dtype=np.int64) * n)
     ends = np.cumsum([own.size for own in pairs])[:-1]
-    slots = [own.reshape(-1, corners, corners) for own in np.split(places, ends)]
+    slots = [own.reshape(pair.shape) for own, pair in zip(np.split(places, ends), pairs, strict=True)]
     return row_starts, keys % n, slots
 
 

@@ -1,4 +1,4 @@
-"""Meshes of linear triangles (2D) and tetrahedra (3D): checks, named sets, boundary, quality, builders.
+"""Meshes of triangles (2D) and tetrahedra (3D), linear or quadratic: checks, named sets, boundary, quality, builders.
 
 A :class:`Mesh` holds rest positions and never changes. Whatever can be wrong with it is reported when it is
 made, so that nothing downstream has to look again.
@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
-from math import factorial
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from warpfem.boundary import is_number
 from warpfem.errors import MeshError, source_of, user_code
+from warpfem.shapes import Shape, shape, shape_of_points
 
 Selection: TypeAlias = str | int | Sequence[int] | np.ndarray
 """The name of a set, or indices."""
@@ -28,9 +28,6 @@ Definition: TypeAlias = int | Sequence[int] | np.ndarray | Callable[[np.ndarray]
 
 MIN_QUALITY = 1e-8
 """Cells below this mean-ratio quality count as having no volume: flat, but for rounding."""
-
-# Face k of a positively oriented cell lies opposite its vertex k and is oriented outwards.
-_FACES = {2: np.array([[1, 2], [2, 0], [0, 1]]), 3: np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])}
 
 # Splits of a square and a cube into simplices; corner i + 2 j + 4 k lies at (i, j, k).
 _SQUARE = np.array([[0, 1, 3], [0, 3, 2]])
@@ -67,22 +64,25 @@ class MeshQuality:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
-    """A body at rest, divided into linear triangles (2D) or tetrahedra (3D).
+    """A body at rest, divided into triangles (2D) or tetrahedra (3D), linear or quadratic.
 
     The arrays are copied, checked and made read-only. Sets are stored sorted, each index once; a set may be
     empty, but selecting an empty set is an error.
 
     Attributes:
         points: (n, dim) float64, rest positions [m], dim 2 or 3.
-        cells: (m, dim + 1) int32, the points of each cell: triangles counterclockwise, tetrahedra with
-            det(X1 - X0, X2 - X0, X3 - X0) > 0.
+        cells: (m, k) int32, the points of each cell: triangles counterclockwise, tetrahedra with
+            det(X1 - X0, X2 - X0, X3 - X0) > 0. Linear cells have k = dim + 1 corners. Quadratic ones, k = 6 or 10,
+            have the midpoints of their edges after them, in the order (0, 1), (1, 2), (2, 0) and in 3D (0, 3),
+            (1, 3), (2, 3); edges are curved where their midpoint is not halfway.
         point_sets: named sets of points, each an int32 index array.
         cell_sets: named sets of cells, likewise.
 
     Raises:
         MeshError: the arrays have the wrong shape or type, a point is not finite or belongs to no cell, a
             cell refers to a point that does not exist, repeats a point or another cell, is inverted or has
-            no volume (mean-ratio quality below ``MIN_QUALITY``), or a set is out of range or badly named.
+            no volume (mean-ratio quality of its corners below ``MIN_QUALITY``), midpoints fold a cell, are corners
+            of another one or differ between the cells of an edge, or a set is out of range or badly named.
             :meth:`repaired` mends inverted cells and unused points.
     """
 
@@ -128,7 +128,7 @@ class Mesh:
 
         Args:
             points: (n, dim) rest positions [m].
-            cells: (m, dim + 1) point indices, of either orientation.
+            cells: (m, k) point indices, linear or quadratic, of either orientation.
             point_sets: indices into ``points`` by name; those of dropped points are dropped.
             cell_sets: indices into ``cells`` by name.
 
@@ -136,8 +136,9 @@ class Mesh:
             MeshError: as for :class:`Mesh`, for everything else.
         """
         points, cells = _arrays(points, cells)
-        inverted = _signed_volumes(_spans(points, cells)) < 0.0
-        cells[inverted] = _reversed(cells[inverted])
+        own = _shape_of(points, cells)
+        inverted = _signed_volumes(_spans(points, cells[:, : own.corner_count])) < 0.0
+        cells[inverted] = cells[inverted][:, own.mirrored]
         used = np.unique(cells)
         renumbered = np.full(len(points), -1, dtype=np.int32)
         renumbered[used] = np.arange(len(used), dtype=np.int32)
@@ -238,6 +239,28 @@ class Mesh:
         shift = 0.0 if offset is None else _vector("offset", offset, self.dim)
         return replace(self, points=scale * self.points + shift)
 
+    def quadratic(self) -> Mesh:
+        """Return the mesh with a midpoint on every edge: quadratic cells, ten times as accurate in bending.
+
+        The midpoints follow the points. A point set gains the midpoints between any two of its points. A mesh that is
+        quadratic is returned as it is.
+        """
+        if self.order == 2:
+            return self
+        own = shape(self.dim, 2)
+        places = np.searchsorted(
+            _row_keys(self.edges, self.point_count),
+            _row_keys(np.sort(self.cells[:, own.edges].reshape(-1, 2), axis=1), self.point_count),
+        )
+        middles = self.point_count + places.reshape(self.cell_count, -1).astype(np.int32)
+        sets = {}
+        for name, members in self.point_sets.items():
+            chosen = np.zeros(self.point_count, dtype=bool)
+            chosen[members] = True
+            sets[name] = np.concatenate([members, self.point_count + np.flatnonzero(chosen[self.edges].all(axis=1))])
+        points = np.concatenate([self.points, self.points[self.edges].mean(axis=1)])
+        return Mesh(points, np.concatenate([self.cells, middles], axis=1), sets, self.cell_sets)
+
     # ---- sets
 
     def with_point_set(self, name: str, selection: Definition) -> Mesh:
@@ -259,13 +282,13 @@ class Mesh:
 
         Args:
             name: a non-empty name.
-            selection: cell indices, or a function that takes the cells' centroids (m, dim) [m] and returns
-                a boolean mask (m,).
+            selection: cell indices, or a function that takes the mean places of the cells' corners (m, dim) [m]
+                and returns a boolean mask (m,).
 
         Raises:
             MeshError: the set would be empty or out of range, or the function does not return a mask.
         """
-        members = _defined("cell", name, selection, self.points[self.cells].mean(axis=1))
+        members = _defined("cell", name, selection, self.points[self.corners].mean(axis=1))
         return self._with(cell_sets=_sets("cell", {**self.cell_sets, name: members}, self.cell_count))
 
     def _with(self, **changes: object) -> Mesh:
@@ -331,31 +354,59 @@ class Mesh:
         """Number of cells."""
         return len(self.cells)
 
+    @property
+    def shape(self) -> Shape:
+        """Shape functions and quadrature of the cells."""
+        return _shape_of(self.points, self.cells)
+
+    @property
+    def order(self) -> int:
+        """1 for linear cells, 2 for quadratic ones."""
+        return self.shape.order
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(m, dim + 1) int32, the corners of each cell."""
+        return self.cells[:, : self.dim + 1]
+
     @cached_property
     def cell_volumes(self) -> np.ndarray:
-        """(m,) float64, rest volume of each cell [m^3], in 2D its area [m^2]; > 0."""
-        return _frozen(_signed_volumes(_spans(self.points, self.cells)))
+        """(m,) float64, rest volume of each cell [m^3], in 2D its area [m^2]; > 0. It is that of the quadrature."""
+        return _frozen(self.quadrature_volumes.reshape(self.cell_count, -1).sum(axis=1))
+
+    @cached_property
+    def quadrature_volumes(self) -> np.ndarray:
+        """(m q,) float64, the part of the rest volume of each of the q quadrature points of each cell [m^3]; > 0."""
+        if self.order == 1:
+            return _frozen(_signed_volumes(_spans(self.points, self.cells)))
+        own = self.shape
+        jacobians = own.jacobians(self.points[self.cells], own.quadrature_places)
+        return _frozen(np.linalg.det(jacobians).ravel() * (own.unit_volume / own.quadrature_count))
 
     @cached_property
     def inverse_shape_matrices(self) -> np.ndarray:
-        """(m, dim, dim) float64, B = D_m^-1 [1/m] with columns X_k - X_0 (k = 1..dim) in D_m.
+        """(m q, dim, dim) float64, B = D_m^-1 [1/m] at each of the q quadrature points of each cell (q = 1 if linear).
 
-        With D_s made likewise of current positions, the deformation gradient is F = D_s B; row k - 1 of B is
-        the gradient of the shape function of vertex k.
+        Column k - 1 of D_m is dX/dlambda_k, k = 1..dim; row k - 1 of B is the gradient of lambda_k. In linear cells the
+        column is X_k - X_0 and the row the gradient of the shape function of corner k: with D_s made likewise of
+        current positions, the deformation gradient is F = D_s B.
         """
-        return _frozen(np.linalg.inv(_spans(self.points, self.cells).transpose(0, 2, 1)))
+        if self.order == 1:
+            return _frozen(np.linalg.inv(_spans(self.points, self.cells).transpose(0, 2, 1)))
+        jacobians = self.shape.jacobians(self.points[self.cells], self.shape.quadrature_places)
+        return _frozen(np.linalg.inv(jacobians).reshape(-1, self.dim, self.dim))
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """(k, 2) int32, each edge once, the smaller point index first, sorted."""
-        pairs = [np.sort(self.cells[:, pair], axis=1) for pair in combinations(range(self.dim + 1), 2)]
+        """(k, 2) int32, the corners of each edge once, the smaller point index first, sorted."""
+        pairs = [np.sort(self.corners[:, pair], axis=1) for pair in combinations(range(self.dim + 1), 2)]
         keys = np.sort(_row_keys(np.concatenate(pairs), self.point_count))
         keys = keys[np.diff(keys, prepend=-1) > 0]  # np.unique is ten times slower on millions
         return _frozen(np.stack(np.divmod(keys, self.point_count), axis=1).astype(np.int32))
 
     @cached_property
     def edge_lengths(self) -> np.ndarray:
-        """(k,) float64, rest length of each of ``edges`` [m]."""
+        """(k,) float64, straight rest length of each of ``edges`` [m]."""
         return _frozen(np.linalg.norm(np.diff(self.points[self.edges], axis=1)[:, 0], axis=1))
 
     @property
@@ -370,12 +421,12 @@ class Mesh:
 
     @cached_property
     def quality(self) -> np.ndarray:
-        """(m,) float64 in (0, 1], the mean ratio of each cell: 1 if regular, to 0 as it gets flat.
+        """(m,) float64 in (0, 1], the mean ratio of the corners of each cell: 1 if regular, to 0 as it gets flat.
 
         12 (3 V)^(2/3) / sum(l^2) for tetrahedra (Liu and Joe, Relationship between tetrahedron shape
         measures, BIT 34, 1994, 268-287), 4 sqrt(3) A / sum(l^2) for triangles.
         """
-        return _frozen(_signed_quality(_spans(self.points, self.cells)))
+        return _frozen(_signed_quality(_spans(self.points, self.corners)))
 
     def quality_summary(self) -> MeshQuality:
         """Return the extremes and the mean of quality and edge length."""
@@ -393,7 +444,7 @@ class Mesh:
     @cached_property
     def _boundary_slots(self) -> np.ndarray:
         """Numbers (dim + 1) * cell + local face of the faces that belong to one cell alone."""
-        faces = self.cells[:, _FACES[self.dim]].reshape(-1, self.dim)
+        faces = self.cells[:, self.shape.faces[:, : self.dim]].reshape(-1, self.dim)
         _, first, counts = np.unique(
             _row_keys(np.sort(faces, axis=1), self.point_count), return_index=True, return_counts=True
         )
@@ -401,13 +452,14 @@ class Mesh:
 
     @cached_property
     def boundary_faces(self) -> np.ndarray:
-        """(k, dim) int32, the points of each face that belongs to one cell alone, oriented outwards.
+        """(k, j) int32, the points of each face that belongs to one cell alone, oriented outwards.
 
-        Triangles (3D) have their right-hand normal outwards. Edges (2D) run counterclockwise round the body:
-        the direction (dx, dy) turned to (dy, -dx) points outwards.
+        Linear faces have j = dim corners; quadratic ones have their midpoints after them. Triangles (3D) have their
+        right-hand normal outwards. Edges (2D) run counterclockwise round the body: the direction (dx, dy) turned to
+        (dy, -dx) points outwards.
         """
         cells, faces = np.divmod(self._boundary_slots, self.dim + 1)
-        return _frozen(self.cells[cells[:, None], _FACES[self.dim][faces]])
+        return _frozen(self.cells[cells[:, None], self.shape.faces[faces]])
 
     @cached_property
     def face_cells(self) -> np.ndarray:
@@ -415,26 +467,54 @@ class Mesh:
         return _frozen((self._boundary_slots // (self.dim + 1)).astype(np.int32))
 
     @cached_property
+    def face_sides(self) -> np.ndarray:
+        """(k,) int32, the corner of that cell that each of ``boundary_faces`` is opposite to."""
+        return _frozen((self._boundary_slots % (self.dim + 1)).astype(np.int32))
+
+    @cached_property
     def _boundary_area_vectors(self) -> np.ndarray:
-        spans = _spans(self.points, self.boundary_faces)
+        """(k, q, dim), the parts of the quadrature points of each boundary face in its area vector."""
+        face = self.shape.face
+        tangents = face.jacobians(self.points[self.boundary_faces], face.quadrature_places)
         if self.dim == 2:
-            return spans[:, 0, ::-1] * (1.0, -1.0)
-        return 0.5 * np.cross(spans[:, 0], spans[:, 1])
+            vectors = tangents[..., ::-1, 0] * (1.0, -1.0)
+        else:
+            vectors = np.cross(tangents[..., 0], tangents[..., 1])
+        return vectors * (face.unit_volume / face.quadrature_count)
 
     @cached_property
     def boundary_face_areas(self) -> np.ndarray:
         """(k,) float64, rest area of each of ``boundary_faces`` [m^2], in 2D its length [m]."""
-        return _frozen(np.linalg.norm(self._boundary_area_vectors, axis=1))
+        return _frozen(np.linalg.norm(self._boundary_area_vectors, axis=2).sum(axis=1))
+
+    @cached_property
+    def boundary_face_shares(self) -> np.ndarray:
+        """(k, j) float64, the integral of the shape function of each point of each of ``boundary_faces`` [m^2]."""
+        face = self.shape.face
+        return _frozen(np.linalg.norm(self._boundary_area_vectors, axis=2) @ face.values(face.quadrature_places))
 
     @cached_property
     def boundary_face_normals(self) -> np.ndarray:
-        """(k, dim) float64, outward unit normal of each of ``boundary_faces`` at rest."""
-        return _frozen(self._boundary_area_vectors / self.boundary_face_areas[:, None])
+        """(k, dim) float64, outward unit normal of each of ``boundary_faces`` at rest; the mean one if it is curved."""
+        vectors = self._boundary_area_vectors.sum(axis=1)
+        return _frozen(vectors / np.linalg.norm(vectors, axis=1)[:, None])
 
     @cached_property
     def boundary_points(self) -> np.ndarray:
         """(k,) int32, the points of ``boundary_faces``, sorted, each once."""
         return _frozen(np.unique(self.boundary_faces))
+
+    # ---- linear parts
+
+    @cached_property
+    def linear_cells(self) -> np.ndarray:
+        """(m p, dim + 1) int32, the cells divided into p linear ones each: 1 if linear, else 4 (2D) or 8 (3D)."""
+        return _frozen(self.cells[:, self.shape.parts].reshape(-1, self.dim + 1))
+
+    @cached_property
+    def linear_boundary_faces(self) -> np.ndarray:
+        """(k p, dim) int32, ``boundary_faces`` divided into p linear ones each: 1 if linear, else 2 (2D) or 4 (3D)."""
+        return _frozen(self.boundary_faces[:, self.shape.face.parts].reshape(-1, self.dim))
 
 
 # ---- geometry
@@ -447,7 +527,7 @@ def _spans(points: np.ndarray, simplices: np.ndarray) -> np.ndarray:
 
 
 def _signed_volumes(spans: np.ndarray) -> np.ndarray:
-    return np.linalg.det(spans) / factorial(spans.shape[1])
+    return np.linalg.det(spans) * shape(spans.shape[1], 1).unit_volume
 
 
 def _signed_quality(spans: np.ndarray) -> np.ndarray:
@@ -463,14 +543,15 @@ def _signed_quality(spans: np.ndarray) -> np.ndarray:
     return np.divide(ratio, squares, out=np.zeros_like(ratio), where=squares > 0.0)
 
 
-def _reversed(cells: np.ndarray) -> np.ndarray:
-    """The cells with their last two vertices swapped: of the other orientation."""
-    return np.concatenate([cells[:, :-2], cells[:, :-3:-1]], axis=1)
-
-
 def _mirrored(split: np.ndarray) -> np.ndarray:
     """The mirror image in x of a split of a square or cube."""
-    return _reversed(split ^ 1)
+    return (split ^ 1)[:, shape(split.shape[1] - 1, 1).mirrored]
+
+
+def _shape_of(points: np.ndarray, cells: np.ndarray) -> Shape:
+    own = shape_of_points(points.shape[1], cells.shape[1])
+    assert own is not None
+    return own
 
 
 def _row_keys(rows: np.ndarray, bound: int) -> np.ndarray:
@@ -518,20 +599,20 @@ def _reject(kind: str, bad: np.ndarray, problem: str, advice: str) -> None:
 def _arrays(points: object, cells: object) -> tuple[np.ndarray, np.ndarray]:
     """Copies of points and cells in their types, cells referring to existing points."""
     positions = _array("points", points, "iuf", "an (n, 2) or (n, 3) array of numbers")
-    indices = _array("cells", cells, "iu", "an (m, 3) or (m, 4) array of point indices (integers)")
+    indices = _array("cells", cells, "iu", "an (m, 3), (m, 6), (m, 4) or (m, 10) array of point indices (integers)")
     if positions.ndim != 2 or positions.shape[1] not in (2, 3):
         raise MeshError(f"points must be an (n, 2) or (n, 3) array, not of shape {positions.shape}")
     dim = positions.shape[1]
     if not indices.size:
         raise MeshError("the mesh has no cells: give at least one triangle (2D) or tetrahedron (3D)")
-    if dim == 3 and indices.ndim == 2 and indices.shape[1] == 3:
+    if dim == 3 and indices.ndim == 2 and indices.shape[1] in (3, 6):
         raise MeshError(
             "triangles with points in 3D are a surface, not a solid: fill it with "
             "warpfem.meshing.tetrahedralize, or give points (n, 2) for a plane body"
         )
-    if indices.ndim != 2 or indices.shape[1] != dim + 1:
-        shape = "triangles" if dim == 2 else "tetrahedra"
-        raise MeshError(f"cells must be (m, {dim + 1}) {shape} for points in {dim}D, not of shape {indices.shape}")
+    if indices.ndim != 2 or shape_of_points(dim, indices.shape[1]) is None:
+        kind = "(m, 3) or (m, 6) triangles" if dim == 2 else "(m, 4) or (m, 10) tetrahedra"
+        raise MeshError(f"cells must be {kind} for points in {dim}D, not of shape {indices.shape}")
     positions = positions.astype(np.float64)
     _check_references("cell", positions, indices)
     return positions, indices.astype(np.int32)
@@ -553,7 +634,8 @@ def _check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     again = twins != np.arange(len(cells))
     twin = twins[again][0] if again.any() else None
     _reject("cell", again, f"has the same points as cell {twin}", "keep one of each")
-    quality = _signed_quality(_spans(points, cells))
+    own = _shape_of(points, cells)
+    quality = _signed_quality(_spans(points, cells[:, : own.corner_count]))
     _reject(
         "cell",
         ~(np.abs(quality) >= MIN_QUALITY),
@@ -561,9 +643,27 @@ def _check_cells(points: np.ndarray, cells: np.ndarray) -> None:
         "remove flat cells, or mesh again",
     )
     _reject("cell", quality < 0.0, "is inverted at rest", "Mesh.repaired(points, cells) turns such cells")
+    if own.order == 2:
+        _check_midpoints(points, cells, own)
     unused = np.ones(len(points), dtype=bool)
     unused[cells] = False
     _reject("point", unused, "belongs to no cell", "Mesh.repaired(points, cells) drops such points")
+
+
+def _check_midpoints(points: np.ndarray, cells: np.ndarray, own: Shape) -> None:
+    is_corner = np.zeros(len(points), dtype=bool)
+    is_corner[cells[:, : own.corner_count]] = True
+    middles = cells[:, own.corner_count :]
+    order = "list corners first, then the midpoints of the edges (0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)"
+    _reject("cell", is_corner[middles].any(axis=1), "has a midpoint that is the corner of a cell", order)
+    keys = _row_keys(np.sort(cells[:, own.edges].reshape(-1, 2), axis=1), len(points))
+    _, first, edge = np.unique(keys, return_index=True, return_inverse=True)
+    differs = middles.ravel() != middles.ravel()[first][edge]
+    shared = "has another midpoint on an edge than another cell that shares the edge"
+    _reject("cell", differs.reshape(middles.shape).any(axis=1), shared, "give each edge one midpoint")
+    places = np.concatenate([own.places, own.quadrature_places])
+    folded = ~(np.linalg.det(own.jacobians(points[cells], places)) > 0.0).all(axis=1)
+    _reject("cell", folded, "is folded by its midpoints", f"move them nearer to the middles of its edges, and {order}")
 
 
 def _indices(kind: str, owner: str, value: object, count: int) -> np.ndarray:

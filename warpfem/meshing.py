@@ -28,7 +28,7 @@ from warpfem.errors import MeshError, MissingExtraError, described, one_line
 from warpfem.mesh import Mesh, _array, _check_references
 
 _USD = {".usd", ".usda", ".usdc", ".usdz"}
-_LINEAR = {2: "triangle", 3: "tetra"}
+_CELLS = {2: ("triangle", "triangle6"), 3: ("tetra", "tetra10")}
 _ENTITIES = ("point", "curve", "surface", "volume")  # Gmsh's words, by dimension
 
 # What a whole file has: without it, meshio reads on for ever or takes a part for the whole.
@@ -45,11 +45,12 @@ MAX_CLOSED_AREA_RATIO = 1.1
 
 
 def read_mesh(path: str | os.PathLike[str]) -> Mesh:
-    """Read a mesh of linear tetrahedra (3D) or of linear triangles in a plane of constant z (2D).
+    """Read a mesh of tetrahedra (3D) or of triangles in a plane of constant z (2D), linear or quadratic.
 
-    Inverted cells are turned round and unused points dropped (:meth:`Mesh.repaired`). Named groups of cells
-    become cell sets; named groups of faces, edges and vertices become sets of their points. Gmsh's physical
-    groups without a name are called ``volume_1``, ``surface_2``, ``curve_3`` and ``point_4`` by their tags.
+    Midpoints of quadratic cells stay where the file has them, so that curved edges stay curved. Inverted cells are
+    turned round and unused points dropped (:meth:`Mesh.repaired`). Named groups of cells become cell sets; named
+    groups of faces, edges and vertices become sets of their points. Gmsh's physical groups without a name are called
+    ``volume_1``, ``surface_2``, ``curve_3`` and ``point_4`` by their tags.
 
     Args:
         path: a USD file with a tetrahedral mesh, or what meshio reads by its extension: .msh (Gmsh 2.2 and
@@ -226,11 +227,14 @@ def _solid(file: Any) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], di
     if dim < 2:
         raise MeshError("the file holds no triangles or tetrahedra")
     for block in file.cells:
-        if block.dim == dim and block.type != _LINEAR[dim]:
+        if block.dim == dim and block.type not in _CELLS[dim]:
             raise MeshError(
-                f"the file holds {len(block)} cells of type '{block.type}': only linear triangles and "
-                "tetrahedra can be read; mesh again with elements of first order"
+                f"the file holds {len(block)} cells of type '{block.type}': only triangles and tetrahedra, linear or "
+                "quadratic, can be read; mesh again with these"
             )
+    kinds = {block.type for block in file.cells if block.dim == dim}
+    if len(kinds) > 1:
+        raise MeshError(f"the file mixes cells of types {' and '.join(sorted(kinds))}: mesh again with one of them")
     cells = np.concatenate([block.data for block in file.cells if block.dim == dim])
     points = np.asarray(file.points)
     if dim == 2 and points.shape[1] == 3:

@@ -101,19 +101,28 @@ class Energies:
 
 @dataclass(frozen=True, eq=False)
 class Stresses:
-    """Stresses of every cell as float64 arrays (cell_count, 3, 3) [Pa]; plane strain has its normal stress.
+    """Stresses at every quadrature point as float64 arrays (k, 3, 3) [Pa]; plane strain has its normal stress.
+
+    A linear cell has one quadrature point, so that k = cell_count where all cells are linear; a quadratic one has
+    dim + 1, one after another.
 
     Attributes:
         deformation_gradient: F; in 2D diag(F, 1).
         first_piola_kirchhoff: P = dpsi/dF, force per rest area.
+        cells: the cell of each quadrature point, (k,).
+        points: rest places of the quadrature points, (k, dim) [m].
+        volumes: their parts of the rest volume, (k,) [m^3].
         kirchhoff: tau = P F^T.
         cauchy: sigma = tau / J, force per current area.
-        jacobian: J = det F, (cell_count,).
-        von_mises: sqrt(3/2) |dev sigma|, (cell_count,) [Pa].
+        jacobian: J = det F, (k,).
+        von_mises: sqrt(3/2) |dev sigma|, (k,) [Pa].
     """
 
     deformation_gradient: np.ndarray
     first_piola_kirchhoff: np.ndarray
+    cells: np.ndarray
+    points: np.ndarray
+    volumes: np.ndarray
 
     @cached_property
     def jacobian(self) -> np.ndarray:
@@ -139,15 +148,18 @@ class CellBlock:
 
     Attributes:
         kernels: the kernels of the material.
+        shape: shape of the cells.
         index: the cells' numbers in the model, (count,) int.
         count: cells.
-        arguments: device arrays ``cells, inverse_shape, volume, parameters``.
+        arguments: device arrays ``cells, inverse_shape, volume, parameters`` by name; the second and the third have
+            an entry for each quadrature point, cell by cell.
     """
 
     def __init__(self, kernels: ElementKernels, parts: list[tuple[Body, int, int]], device) -> None:
         t = kernels.types
         meshes = [body.mesh for body, _, _ in parts]
         self.kernels = kernels
+        self.shape = kernels.shape
         self.device = device
         self.count = sum(mesh.cell_count for mesh in meshes)
         self.index = np.concatenate([start + np.arange(b.mesh.cell_count) for b, _, start in parts])
@@ -158,27 +170,39 @@ class CellBlock:
         else:
             table = [np.broadcast_to(r, (m.cell_count, r.shape[1])) for r, m in zip(rows, meshes, strict=True)]
             parameters = wp.array(np.concatenate(table), dtype=kernels.parameter_vector, device=device)
-        self.arguments = [
-            wp.array(self.host_cells, dtype=t.cell, device=device),
-            wp.array(
+        self.arguments = {
+            "cells": wp.array(self.host_cells, dtype=kernels.cell_type, device=device),
+            "inverse_shape": wp.array(
                 np.concatenate([mesh.inverse_shape_matrices for mesh in meshes]),
                 dtype=t.matrix,
                 device=device,
             ),
-            wp.array(np.concatenate([mesh.cell_volumes for mesh in meshes]), dtype=t.scalar, device=device),
-            parameters,
-        ]
+            "volume": wp.array(
+                np.concatenate([mesh.quadrature_volumes for mesh in meshes]), dtype=t.scalar, device=device
+            ),
+            "parameters": parameters,
+        }
 
     def launch(self, name: str, inputs: list, outputs: list, *, part: slice | None = None) -> None:
-        """Launches the kernel of that name over the cells, or a part of them.
+        """Launches the kernel of that name over the quadrature points of the cells, or of a part of them.
 
-        Of :attr:`arguments` it gets first those that it names.
+        Of :attr:`arguments` it gets first those that it names. The kernel ``frequency`` runs over cells.
         """
         kernel = getattr(self.kernels, name)
-        arrays = self.arguments if part is None else [array[part] for array in self.arguments]
-        known = dict(zip(("cells", "inverse_shape", "volume", "parameters"), arrays, strict=True))
-        own = [known[argument.label] for argument in kernel.adj.args if argument.label in known]
-        wp.launch(kernel, len(arrays[0]), inputs=[*own, *inputs], outputs=outputs, device=self.device)
+        arrays = self.arguments if part is None else self._arguments_of(part)
+        own = [arrays[argument.label] for argument in kernel.adj.args if argument.label in arrays]
+        tasks = len(arrays["cells"]) if name == "frequency" else len(arrays["volume"])
+        wp.launch(kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device)
+
+    def _arguments_of(self, part: slice) -> dict[str, wp.array]:
+        places = self.shape.quadrature_count
+        inner = slice(part.start * places, part.stop * places)
+        by_cell = ("cells", "parameters")
+        return {name: array[part if name in by_cell else inner] for name, array in self.arguments.items()}
+
+    def per_cell(self, values: np.ndarray) -> np.ndarray:
+        """Values of the quadrature points (k, ...) as an array (count, q, ...)."""
+        return values.reshape(self.count, self.shape.quadrature_count, *values.shape[1:])
 
 
 class Model:
@@ -244,7 +268,7 @@ class Model:
     def _cell_blocks(self) -> list[CellBlock]:
         parts: dict[ElementKernels, list[tuple[Body, int, int]]] = {}
         for body, point_start, cell_start in zip(self.scene.bodies, self.point_starts, self.cell_starts, strict=False):
-            kernels = element_kernels(body.material.constitutive, self.dim, self.dtype)
+            kernels = element_kernels(body.material.constitutive, body.mesh.shape, self.dtype)
             parts.setdefault(kernels, []).append((body, int(point_start), int(cell_start)))
         return [CellBlock(kernels, bodies, self.device) for kernels, bodies in parts.items()]
 
@@ -271,13 +295,13 @@ class Model:
             return [float(np.max(body.material.moduli.p_wave)) for body in bodies]
         # from each cell's own stiffness: the uniform stretch u = X_x e_x has the energy V/2 d²psi/dF_xx²
         modulus = np.zeros(self.cell_count)
+        rest, volume = self.rest_points, np.concatenate([body.mesh.cell_volumes for body in bodies])
         for block, part, stiffness in self.element_stiffness_parts():
-            _, inverse_shape, volume, _ = block.arguments
-            edges = np.linalg.inv(inverse_shape.numpy()[part].astype(np.float64))  # columns X_k - X_0
-            stretch = np.zeros((len(edges), self.dim + 1, self.dim))
-            stretch[:, 1:, 0] = edges[:, 0, :]
+            stretch = np.zeros(stiffness.shape[:3])
+            points = rest[block.host_cells[part], 0]
+            stretch[..., 0] = points - points[:, :1]
             work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
-            modulus[block.index[part]] = work / volume.numpy()[part]
+            modulus[block.index[part]] = work / volume[block.index[part]]
         return [float(modulus[cells].max()) for _, cells in self.body_slices]
 
     def _slip_speed(self) -> float:
@@ -300,7 +324,7 @@ class Model:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        own = [self.mass, self.inverse_mass, *(array for block in self.blocks for array in block.arguments)]
+        own = [self.mass, self.inverse_mass, *(array for block in self.blocks for array in block.arguments.values())]
         if self.dead_load is not None:
             own.append(self.dead_load)
         for term in (self.supports, self.contact):
@@ -343,15 +367,17 @@ class Model:
         return float(self._sum.numpy()[0])
 
     def energy_densities(self, state: State) -> np.ndarray:
-        """The energy density psi of every cell, (cell_count,) float64 [J/m^3], 0 at rest.
+        """The energy density psi of every cell, its mean if quadratic, (cell_count,) float64 [J/m^3], 0 at rest.
 
         Infinite where a cell of a material that does not bear inversion has J <= 0.
         """
         psi = np.empty(self.cell_count)
         for block in self.blocks:
-            out = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
+            volume = block.arguments["volume"]
+            out = wp.zeros_like(volume)
             block.launch("density", [state.u], [out])
-            psi[block.index] = out.numpy()
+            weights = block.per_cell(volume.numpy().astype(np.float64))
+            psi[block.index] = (weights * block.per_cell(out.numpy())).sum(axis=1) / weights.sum(axis=1)
         return psi
 
     def contact_energy(self, u: wp.array) -> float:
@@ -425,8 +451,8 @@ class Model:
         """Tangent stiffness of each cell at ``u`` (default: at rest).
 
         Returns:
-            For each block of :attr:`blocks` a float64 array (count, d+1, d, d+1, d) [N/m], indexed by
-            point and component of the force, then of the displacement.
+            For each block of :attr:`blocks` a float64 array (count, k, d, k, d) [N/m] for cells of k points,
+            indexed by point and component of the force, then of the displacement.
         """
         parts: dict[CellBlock, list[np.ndarray]] = {block: [] for block in self.blocks}
         for block, _, stiffness in self.element_stiffness_parts(u):
@@ -441,10 +467,12 @@ class Model:
         """
         if u is None:
             u = self.zeros()
-        d, corners = self.dim, self.dim + 1
+        d = self.dim
         for block in self.blocks:
-            for start in range(0, block.count, STIFFNESS_PART):
-                part = slice(start, min(start + STIFFNESS_PART, block.count))
+            corners = block.shape.point_count
+            most = STIFFNESS_PART * (d + 1) ** 2 // corners**2
+            for start in range(0, block.count, most):
+                part = slice(start, min(start + most, block.count))
                 count = part.stop - start
                 slots = np.arange(count * corners**2, dtype=np.int32).reshape(count, corners, corners)
                 values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
@@ -454,23 +482,35 @@ class Model:
                 yield block, part, entries.transpose(0, 1, 3, 2, 4)
 
     def stresses(self, state: State) -> Stresses:
-        """Deformation gradients and stresses of every cell."""
+        """Deformation gradients and stresses at every quadrature point: one per linear cell, dim + 1 per quadratic."""
         solid = wp.types.matrix(shape=(3, 3), dtype=self.types.scalar)
-        P = np.empty((self.cell_count, 3, 3))
-        F = np.tile(np.eye(3), (self.cell_count, 1, 1))
-        u = state.displacement
+        places = np.empty(self.cell_count, dtype=np.int64)
         for block in self.blocks:
-            out = wp.zeros(block.count, dtype=solid, device=self.device)
+            places[block.index] = block.shape.quadrature_count
+        starts = np.concatenate([[0], np.cumsum(places)])
+        count = int(starts[-1])
+        P, F = np.empty((count, 3, 3)), np.tile(np.eye(3), (count, 1, 1))
+        points, volumes = np.empty((count, self.dim)), np.empty(count)
+        u, rest = state.displacement, self.rest_points
+        for block in self.blocks:
+            own = (starts[block.index][:, None] + np.arange(block.shape.quadrature_count)).ravel()
+            volume = block.arguments["volume"]
+            out = wp.zeros(len(volume), dtype=solid, device=self.device)
             block.launch("stress", [state.u], [out])
-            P[block.index] = out.numpy()
+            P[own], volumes[own] = out.numpy(), volume.numpy()
             corners = u[block.host_cells]
-            edges = corners[:, 1:] - corners[:, :1]
-            B = block.arguments[1].numpy().astype(np.float64)
-            F[block.index, : self.dim, : self.dim] += np.einsum("cki,ckj->cij", edges, B)
-        return Stresses(F, P)
+            B = block.per_cell(block.arguments["inverse_shape"].numpy().astype(np.float64))
+            gradients = np.einsum("qak,cqkj->cqaj", block.shape.quadrature_gradients, B)
+            H = np.einsum("cai,cqaj->cqij", corners - corners[:, :1], gradients)
+            F[own, : self.dim, : self.dim] += H.reshape(-1, self.dim, self.dim)
+            values = block.shape.values(block.shape.quadrature_places)
+            points[own] = np.einsum("qa,cai->cqi", values, rest[block.host_cells]).reshape(-1, self.dim)
+        return Stresses(F, P, np.repeat(np.arange(self.cell_count), places), points, volumes)
 
     def tractions(self, state: State, body: int = 0) -> np.ndarray:
         """Cauchy traction sigma n [Pa] on every boundary face of a body in its current shape.
+
+        On quadratic faces it is that at the centroid, from the linear function through the cell's quadrature points.
 
         Args:
             state: the state.
@@ -480,28 +520,34 @@ class Model:
             (face_count, dim) float64, in the order of the mesh's ``boundary_faces``.
         """
         mesh = self.scene.bodies[body].mesh
-        cells = self.cell_starts[body] + mesh.face_cells
         stresses = self.stresses(state)
-        normals = np.zeros((len(cells), 3))
+        own = (stresses.cells >= self.cell_starts[body]) & (stresses.cells < self.cell_starts[body + 1])
+        weights = mesh.shape.face_weights[mesh.face_sides]
+
+        def at_faces(values: np.ndarray) -> np.ndarray:
+            per_cell = values[own].reshape(mesh.cell_count, -1, 3, 3)
+            return np.einsum("fq,fqij->fij", weights, per_cell[mesh.face_cells])
+
+        normals = np.zeros((len(weights), 3))
         normals[:, : self.dim] = mesh.boundary_face_normals
-        nominal = np.einsum("fij,fj->fi", stresses.first_piola_kirchhoff[cells], normals)  # per rest area
-        F = stresses.deformation_gradient[cells]
+        F = at_faces(stresses.deformation_gradient)
+        nominal = np.einsum("fij,fj->fi", at_faces(stresses.first_piola_kirchhoff), normals)  # per rest area
         inverse_transpose = np.linalg.inv(F).transpose(0, 2, 1)
-        area_ratio = stresses.jacobian[cells] * np.linalg.norm(
-            np.einsum("fij,fj->fi", inverse_transpose, normals), axis=1
-        )
+        area_ratio = np.linalg.det(F) * np.linalg.norm(np.einsum("fij,fj->fi", inverse_transpose, normals), axis=1)
         return (nominal / area_ratio[:, None])[:, : self.dim]
 
     def diagnostics(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """J and von Mises stress [Pa] of every cell, float64 arrays (cell_count,)."""
+        """J and von Mises stress [Pa] of every cell, float64 arrays (cell_count,).
+
+        Of the quadrature points of a quadratic cell it is the least J and the mean stress.
+        """
         jacobian = np.empty(self.cell_count)
         von_mises = np.empty(self.cell_count)
         for block in self.blocks:
-            J = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
-            stress = wp.zeros(block.count, dtype=self.types.scalar, device=self.device)
+            J, stress = wp.zeros_like(block.arguments["volume"]), wp.zeros_like(block.arguments["volume"])
             block.launch("diagnostics", [state.u], [J, stress])
-            jacobian[block.index] = J.numpy()
-            von_mises[block.index] = stress.numpy()
+            jacobian[block.index] = block.per_cell(J.numpy()).min(axis=1)
+            von_mises[block.index] = block.per_cell(stress.numpy()).mean(axis=1)
         return jacobian, von_mises
 
     def body_of_cell(self, cell: int) -> tuple[Body, int]:
@@ -539,18 +585,19 @@ def _require_resolved(scene: Scene, epsilon: float, dtype: str) -> None:
         if len(thin):
             advice = "remesh" if dtype == "float64" else 'take dtype="float64", or remesh'
             raise SceneError(
-                f"body '{body.name}': cell {thin[0]} is {1.0 / steepest[thin[0]]:.2g} m high ({len(thin)} such cells): "
+                f"body '{body.name}': cell {thin[0] // mesh.shape.quadrature_count} is {1.0 / steepest[thin[0]]:.2g} m "
+                f"high ({len(thin)} such cells): "
                 f"{dtype} resolves no less than {10.0 * epsilon * size:.2g} m in a body of {size:.3g} m: {advice}"
             )
 
 
 def _lumped_mass(scene: Scene) -> np.ndarray:
-    """Each cell's mass shared equally among its points."""
+    """Each cell's mass shared among its points."""
     masses = []
     for body in scene.bodies:
         mesh = body.mesh
-        share = np.broadcast_to(body.density * mesh.cell_volumes / (mesh.dim + 1), mesh.cell_count)
-        masses.append(np.bincount(mesh.cells.ravel(), np.repeat(share, mesh.dim + 1), mesh.point_count))
+        shares = np.outer(body.density * mesh.cell_volumes, mesh.shape.mass_shares)
+        masses.append(np.bincount(mesh.cells.ravel(), shares.ravel(), mesh.point_count))
     return np.concatenate(masses)
 
 
@@ -576,9 +623,8 @@ def _dead_load(scene: Scene, mass: np.ndarray, point_starts: np.ndarray) -> np.n
                 faces = body.mesh.select_faces(term.points)
             except ValueError as error:
                 raise SceneError(f"{where}: {error}") from None
-            share = np.outer(body.mesh.boundary_face_areas[faces] / scene.dim, value)
-            for corner in range(scene.dim):
-                np.add.at(load, start + body.mesh.boundary_faces[faces, corner], share)
+            shares = body.mesh.boundary_face_shares[faces]
+            np.add.at(load, start + body.mesh.boundary_faces[faces], shares[:, :, None] * value)
     return load
 
 

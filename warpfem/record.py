@@ -7,6 +7,8 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from warpfem import __version__
 from warpfem.checkpoint import Checkpoint, checkpoint_path, scene_parts
 from warpfem.dtypes import FloatName
@@ -138,8 +140,8 @@ def _usd_bodies(scene: Scene) -> list[UsdBody]:
         UsdBody(
             body.name,
             body.mesh.points,
-            body.mesh.cells,
-            body.mesh.boundary_faces if scene.dim == 3 else body.mesh.cells,
+            body.mesh.linear_cells,
+            body.mesh.linear_boundary_faces if scene.dim == 3 else body.mesh.linear_cells,
         )
         for body in scene.bodies
     ]
@@ -149,10 +151,12 @@ def _body_frames(simulation: Simulation, frame: Frame) -> list[BodyFrame]:
     from warpfem.usd import BodyFrame
 
     x = simulation.model.rest_points + frame.displacement
-    return [
-        BodyFrame(x[points], frame.velocity[points], frame.von_mises[cells], frame.jacobian[cells])
-        for points, cells in simulation.model.body_slices
-    ]
+    frames = []
+    for body, (points, cells) in zip(simulation.scene.bodies, simulation.model.body_slices, strict=True):
+        parts = len(body.mesh.shape.parts)
+        von_mises, jacobian = (np.repeat(values[cells], parts) for values in (frame.von_mises, frame.jacobian))
+        frames.append(BodyFrame(x[points], frame.velocity[points], von_mises, jacobian))
+    return frames
 
 
 @contextlib.contextmanager

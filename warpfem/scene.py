@@ -20,6 +20,9 @@ PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
 """One vector for all points, an array (point_count, dim), or a function of the rest points."""
 
 
+ELEMENTS = ("linear", "quadratic")
+"""What a body's cells can be."""
+
 _MOST = 1e12
 """The largest number of frames per second, time step [s] or damping [1/s]: what is beyond overflows in float32."""
 
@@ -41,6 +44,9 @@ class Body:
             1 m thick.
         supports: pins and prescribed motions.
         loads: point forces and tractions.
+        element: "linear" or "quadratic"; ``None`` takes the mesh as it is. "quadratic" gives a linear mesh midpoints
+            (:meth:`Mesh.quadratic`), and :attr:`mesh` is then the quadratic one, to which arrays per point refer:
+            several times the cost, for an accuracy that linear cells reach at a hundred times the cost or never.
         displacement: initial displacement [m]: one vector for all points, an array (point_count, dim), or a
             function of the rest points (point_count, dim) that returns either; ``None`` starts at rest shape.
         velocity: initial velocity [m/s], likewise; ``None`` starts at rest.
@@ -52,6 +58,7 @@ class Body:
     density: float | np.ndarray = 1000.0
     supports: Sequence[Support] = ()
     loads: Sequence[Load] = ()
+    element: Literal["linear", "quadratic"] | None = None
     displacement: PointField | None = None
     velocity: PointField | None = None
 
@@ -65,6 +72,7 @@ class Body:
                 f"body '{self.name}': material must be a warpfem material, for example "
                 f"StableNeoHookean(E=1e5, nu=0.45), not {self.material!r}"
             )
+        self._choose_element()
         for name in ("supports", "loads"):
             _require_list(f"body '{self.name}': {name}", getattr(self, name))
         try:
@@ -86,6 +94,21 @@ class Body:
             self.material.parameter_rows(self.mesh.cell_count)
         except ValueError as error:
             raise SceneError(f"body '{self.name}': {error}") from None
+
+    def _choose_element(self) -> None:
+        order = self.mesh.order
+        if self.element is None:
+            object.__setattr__(self, "element", ELEMENTS[order - 1])
+        elif not isinstance(self.element, str) or self.element not in ELEMENTS:
+            known = " or ".join(map(repr, ELEMENTS))
+            raise SceneError(f"body '{self.name}': element must be {known}, not {self.element!r}")
+        elif self.element == "quadratic":
+            object.__setattr__(self, "mesh", self.mesh.quadratic())
+        elif order == 2:
+            raise SceneError(
+                f"body '{self.name}': element='{self.element}', but the mesh is quadratic: leave it out, or give the "
+                "linear mesh"
+            )
 
     def initial_displacement(self) -> np.ndarray:
         """Initial displacement, (point_count, dim) float64 [m]."""

@@ -267,7 +267,7 @@ def _appears(label: str, setting: Setting, solver: Solver, bad: float, place: st
     next(frames)
     last = next(frames)
     if place == "cell":  # as if its rest shape had been bad
-        model.blocks[0].arguments[1].numpy()[model.cell_starts[1] + 2] = bad
+        model.blocks[0].arguments["inverse_shape"].numpy()[model.cell_starts[1] + 2] = bad
     else:
         (state.u if place == "displacement" else state.v).numpy()[model.point_starts[1] + 2] = bad
         state.revision += 1
