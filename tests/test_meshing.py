@@ -178,7 +178,6 @@ def test_a_plane_of_constant_z_is_2d(tmp_path):
     ("cells", "message"),
     [
         ([("triangle", [[0, 1, 2], [0, 1, 3]])], r"constant z: they are a surface; .*tetrahedralize"),
-        ([("tetra20", [[*range(10), *range(10)]])], "1 cells of type 'tetra20': only triangles"),
         ([("tetra", [[0, 1, 2, 3]]), ("tetra10", [range(10)])], "mixes cells of types tetra and tetra10"),
         (
             [("tetra", [[0, 1, 2, 3]]), ("hexahedron", [range(8)])],
