@@ -1,11 +1,14 @@
 """Time integration, and static equilibrium."""
 
+from warpfem.solvers.backward_euler import BackwardEuler
 from warpfem.solvers.base import Solver, Stepper, StepReport
 from warpfem.solvers.explicit import SymplecticEuler, VelocityVerlet
-from warpfem.solvers.implicit import BackwardEuler
+from warpfem.solvers.runge_kutta import SDIRK2, ImplicitMidpoint
 from warpfem.solvers.static import StaticEquilibrium
 
-SOLVERS: dict[str, type[Solver]] = {solver.name: solver for solver in (SymplecticEuler, VelocityVerlet, BackwardEuler)}
+SOLVERS: dict[str, type[Solver]] = {
+    solver.name: solver for solver in (SymplecticEuler, VelocityVerlet, BackwardEuler, ImplicitMidpoint, SDIRK2)
+}
 """The solvers by name."""
 
 __all__ = [

@@ -11,7 +11,7 @@ from warpfem.mesh import Mesh
 from warpfem.model import Model, State
 from warpfem.scene import Body
 from warpfem.solvers.base import StepReport, require_count, require_tolerance, worst_cell
-from warpfem.solvers.implicit import BackwardEuler, _BackwardEulerStepper
+from warpfem.solvers.newton import Newton, NewtonSettings
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class StaticEquilibrium:
                 "with friction the equilibrium depends on the way there: take friction=0, or BackwardEuler with "
                 "damping until the bodies rest"
             )
-        stepper = _StaticStepper(model, BackwardEuler(self.tolerance, self.max_iterations))
-        report = stepper.solve(state)
-        u = State(stepper.solution, state.v)
+        newton = Newton(model, NewtonSettings(self.tolerance, self.max_iterations))
+        report = _minimise(newton, state)
+        u = State(newton.u, state.v)
         jacobian, _ = model.diagnostics(u)
         if (jacobian <= 0.0).any():
             raise SimulationError(
@@ -63,7 +63,7 @@ class StaticEquilibrium:
                 f"{worst_cell(model, u.u)}. Start nearer to it, with smaller loads, or take NeoHookean"
             )
         _require_unfolded(model, u.displacement)
-        wp.copy(state.u, stepper.solution)
+        wp.copy(state.u, newton.u)
         state.v.zero_()
         state.revision += 1
         return report
@@ -81,30 +81,19 @@ def _require_unfolded(model: Model, displacement: np.ndarray) -> None:
             )
 
 
-class _StaticStepper(_BackwardEulerStepper):
-    """The Newton iteration of backward Euler, with a weight of inertia of 0."""
-
-    def solve(self, state: State) -> StepReport:
-        self._weight, self._dt, self._start = 0.0, 1.0, state.u
-        self._predicted.zero_()
-        if self.model.supports is not None:
-            self.model.supports.advance(state.time, 0.0)
-        report = self._newton(state, state.time)
-        if not report.converged:
-            raise SimulationError(
-                f"no static equilibrium found: {report.note}, with a residual of {report.residual:.1e}; "
-                f"{worst_cell(self.model, self._u)}. Start nearer to it, or with smaller loads"
-            )
-        return report
-
-    @property
-    def solution(self) -> wp.array:
-        return self._u
-
-    def _choose_start(self, state: State) -> float:
-        self._d.zero_()
-        self._move(self._d, self._u)
-        return self._potential(self._d, self._u)
+def _minimise(newton: Newton, state: State) -> StepReport:
+    """Minimises the potential energy from a state, with supports where they are at its time."""
+    model = newton.model
+    newton.potential.pose(state.u, weight=0.0, duration=1.0)
+    if model.supports is not None:
+        model.supports.advance(state.time, 0.0)
+    report = newton.minimise(newton.start_at_base(), state.time)
+    if not report.converged:
+        raise SimulationError(
+            f"no static equilibrium found: {report.note}, with a residual of {report.residual:.1e}; "
+            f"{worst_cell(model, newton.u)}. Start nearer to it, or with smaller loads"
+        )
+    return report
 
 
 def free_rigid_modes(model: Model, index: int) -> list[tuple[str, list[str]]]:
