@@ -65,6 +65,8 @@ def test_registry_names_the_solvers():
         "symplectic_euler": 1,
         "velocity_verlet": 2,
         "backward_euler": 1,
+        "implicit_midpoint": 2,
+        "sdirk2": 2,
     }
 
 

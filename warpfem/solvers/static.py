@@ -1,5 +1,6 @@
 """Static equilibrium: the state of least potential under the loads, without inertia."""
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,9 @@ class StaticEquilibrium:
                 "with friction the equilibrium depends on the way there: take friction=0, or BackwardEuler with "
                 "damping until the bodies rest"
             )
+        if model.static_load is not model.dead_load:
+            model = copy.copy(model)
+            model.dead_load = model.static_load
         newton = Newton(model, NewtonSettings(self.tolerance, self.max_iterations))
         report = _minimise(newton, state)
         u = State(newton.u, state.v)
