@@ -184,9 +184,8 @@ def test_quadratic_files_keep_their_curved_edges(suffix, dim, tmp_path):
     path = tmp_path / f"curved{suffix}"
     points = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
     kind = "tetra10" if dim == 3 else "triangle6"
-    meshio.write(
-        path, meshio.Mesh(points, [(kind, mesh.cells)]), **({"file_format": "gmsh"} if suffix == ".msh" else {})
-    )
+    formats = {".msh": "gmsh", ".vtu": "vtu", ".inp": "abaqus"}
+    meshio.write(path, meshio.Mesh(points, [(kind, mesh.cells)]), file_format=formats[suffix])
     again = wf.read_mesh(path)
     assert again.order == 2
     np.testing.assert_array_equal(again.cells, mesh.cells)
