@@ -67,6 +67,8 @@ def test_cantilever():
         ratios.append(-displacement(simulation, frames[-1], 0, "right")[:, 1].mean() / sag)
     assert ratios[0] < ratios[1]
     assert 0.8 < ratios[1] < 1.0
+    simulation, frames = run("cantilever", cells=2, E=E, nu=nu, element="quadratic")
+    assert -displacement(simulation, frames[-1], 0, "right")[:, 1].mean() == pytest.approx(sag, rel=0.04)
 
 
 def test_twist():
