@@ -467,6 +467,19 @@ def test_explicit_steps_of_quadratic_cells_keep_the_energy():
     assert swing < 2e-3 * simulation.summary.last_energies.elastic
 
 
+def test_a_run_of_quadratic_cells_is_taken_up_again(tmp_path):
+    def simulation() -> wf.Simulation:
+        return wf.Simulation(scene(2, wf.BackwardEuler(), supports=[wf.Pin("left")], dt=0.02, fps=50, frames=4))
+
+    *_, whole = simulation().frames()
+    path = tmp_path / "block.usdc"
+    frames = wf.record(simulation(), path, checkpoint_every=1)
+    next(frames), next(frames), next(frames)
+    frames.close()
+    *_, again = wf.record(simulation(), path, resume=True)
+    np.testing.assert_array_equal(again.displacement, whole.displacement)
+
+
 def test_bodies_of_both_kinds_share_a_scene():
     bodies = [
         wf.Body(name, block(2).transformed(offset=(2.0 * k, 0.0)), wf.StableNeoHookean(E, NU), element=name)
