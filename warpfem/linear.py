@@ -517,6 +517,11 @@ class ConjugateGradients:
         """The device arrays held."""
         return [self._r, self._z, self._p, self._q, self._scalars]
 
+    @property
+    def direction(self) -> tuple[np.ndarray, np.ndarray]:
+        """The last search direction p and its product A p, float64 copies (point_count, dim)."""
+        return self._p.numpy().astype(np.float64), self._q.numpy().astype(np.float64)
+
     def solve(
         self,
         operator: TangentOperator,

@@ -64,6 +64,10 @@ def support_kernels(dim: int, dtype: str) -> SimpleNamespace:
     return SimpleNamespace(hold=hold, project=project, hold_rows=hold_rows)
 
 
+_SAMPLES = (0.25, 0.382, 0.5, 0.75)
+"""Where the way of supports is looked at: not only where a number of full turns has come round."""
+
+
 @dataclass
 class _Moving:
     body: str
@@ -177,6 +181,41 @@ class Supports:
             rate[part.rows] = np.where(part.held, mean_rate, rate[part.rows])
         self.target.assign(target.astype(self.types.numpy))
         self.target_rate.assign(rate.astype(self.types.numpy))
+
+    def approach(self, time: float, fraction: float) -> None:
+        """Sets the targets to those at a fraction of the way from rest to ``time``.
+
+        They are those at ``fraction`` times ``time``, less what is left of the displacement that a motion begins with.
+        """
+        if self._moving:
+            self.target.assign(self._on_the_way(time, fraction).astype(self.types.numpy))
+            self.target_rate.zero_()
+
+    def bend(self, time: float, first: float, last: float) -> float:
+        """How far the way of :meth:`approach` strays from the straight between two fractions, relative to its length.
+
+        In a turn by 90 degrees it is 0.2, in a full one infinite.
+        """
+        if not self._moving:
+            return 0.0
+        start, end = self._on_the_way(time, first), self._on_the_way(time, last)
+        strayed = 0.0
+        for s in _SAMPLES:
+            straight = (1.0 - s) * start + s * end
+            place = self._on_the_way(time, (1.0 - s) * first + s * last)
+            strayed = max(strayed, float(np.linalg.norm(place - straight, axis=1).max()))
+        length = float(np.linalg.norm(end - start, axis=1).max())
+        rounding = 1e-12 * max(float(np.abs(part.rest).max()) for part in self._moving)
+        if strayed <= rounding:
+            return 0.0
+        return strayed / length if length > 0.0 else np.inf
+
+    def _on_the_way(self, time: float, fraction: float) -> np.ndarray:
+        target = np.zeros_like(self._target)
+        for part in self._moving:
+            now = part.displacement(fraction * time) - (1.0 - fraction) * part.displacement(0.0)
+            target[part.rows] = np.where(part.held, now, target[part.rows])
+        return target
 
     def hold(self, u: wp.array, v: wp.array) -> None:
         """Puts the held components of ``u`` and ``v`` at their targets."""

@@ -209,13 +209,16 @@ class IncrementalPotential:
         """Writes -dPhi/dd to :attr:`force`.
 
         Returns:
-            For each body, since none feels another, its norm and that of the largest of its parts, where not held.
+            For each body, since none feels another, its norm and that of the largest of its parts, where not held;
+            without inertia, the internal force at held components counts among the parts.
         """
         model, force, part = self.model, self.force, self.part
         self._launch("inertia_force", [model.mass, self.weight, self.predicted, d], [force])
         sizes = [self._free_norms(force)]
         part.zero_()
         model.add_internal_force(u, part)
+        if self.weight == 0.0:  # where supports alone strain a body at rest, no other force acts
+            sizes.append(self._norms(part))
         sizes.append(self._free_norms(part))
         self.add_scaled(force, 1.0, part, force)
         if model.dead_load is not None:
@@ -232,11 +235,13 @@ class IncrementalPotential:
 
     def _free_norms(self, vector: wp.array) -> np.ndarray:
         """Sets the held components of a vector to zero; returns its norm over each body's points."""
-        model = self.model
-        if model.supports is not None:
-            model.supports.project(vector)
-        parts = [vector[points] for points, _ in model.body_slices]
-        return np.sqrt([model.dot(part, part) for part in parts])
+        if self.model.supports is not None:
+            self.model.supports.project(vector)
+        return self._norms(vector)
+
+    def _norms(self, vector: wp.array) -> np.ndarray:
+        parts = [vector[points] for points, _ in self.model.body_slices]
+        return np.sqrt([self.model.dot(part, part) for part in parts])
 
     def linearize(self, u: wp.array, hessian: Hessian) -> None:
         """Makes :attr:`operator` the second derivative at u."""
