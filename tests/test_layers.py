@@ -16,7 +16,7 @@ LAYERS = [
     {"scene"},
     {"supports", "contact"},
     {"model"},
-    {"linear"},
+    {"linear", "reactions"},
     {"solvers"},
     {"simulation"},
     {"usd", "checkpoint", "failure"},
