@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "warpfem"
 
 LAYERS = [
     {"errors", "shapes"},
-    {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child"},
+    {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child", "recovery"},
     {"mesh", "points"},
     {"materials"},
     {"elements", "meshing", "folds"},

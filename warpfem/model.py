@@ -519,6 +519,32 @@ class Model:
             points[own] = np.einsum("qa,cai->cqi", values, rest[block.host_cells]).reshape(-1, self.dim)
         return Stresses(F, P, np.repeat(np.arange(self.cell_count), places), points, volumes)
 
+    def nodal_stresses(self, state: State) -> np.ndarray:
+        """Cauchy stresses at the points, recovered from those in the cells about them (see ``recovery.py``).
+
+        They are smooth in each body: where its material changes from cell to cell, the cells' own tell more.
+
+        Returns:
+            (point_count, 3, 3) float64 [Pa].
+        """
+        from warpfem.recovery import recover
+
+        stresses = self.stresses(state)
+        result = np.empty((self.point_count, 3, 3))
+        for body, (points, cells) in zip(self.scene.bodies, self.body_slices, strict=True):
+            mesh = body.mesh
+            own = (stresses.cells >= cells.start) & (stresses.cells < cells.stop)
+            result[points] = recover(
+                mesh.points,
+                mesh.cells,
+                mesh.boundary_points,
+                stresses.points[own],
+                stresses.cells[own] - cells.start,
+                stresses.cauchy[own],
+                degree=mesh.order,
+            )
+        return result
+
     def tractions(self, state: State, body: int = 0) -> np.ndarray:
         """Cauchy traction sigma n [Pa] on every boundary face of a body in its current shape.
 
