@@ -300,7 +300,7 @@ def test_help_names_every_command(capsys):
         main(["--help"])
     assert end.value.code == 0
     printed = capsys.readouterr().out
-    for command in ("run", "explain", "preview", "info"):
+    for command in ("run", "static", "explain", "preview", "info"):
         assert command in printed
 
 

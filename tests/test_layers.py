@@ -21,6 +21,7 @@ LAYERS = [
     {"simulation"},
     {"usd", "checkpoint", "failure"},
     {"record", "explain", "scene_file", "preview"},
+    {"static_run"},
     {"extremes"},
     {"cli"},
     {"__main__"},

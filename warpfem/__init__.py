@@ -33,10 +33,12 @@ from warpfem.mesh import Mesh
 from warpfem.meshing import read_mesh, read_surface, tetrahedralize
 from warpfem.model import Energies, Model, State, Stresses
 from warpfem.moduli import ElasticModuli, elastic_moduli
+from warpfem.reactions import PointForces, Reactions, reactions
 from warpfem.record import record, run
 from warpfem.scene import Body, Scene
 from warpfem.simulation import Frame, Simulation, Summary
 from warpfem.solvers import SOLVERS, BackwardEuler, StaticEquilibrium, SymplecticEuler, VelocityVerlet
+from warpfem.static_run import run_static
 
 __all__ = [
     "MATERIALS",
@@ -60,7 +62,9 @@ __all__ = [
     "Pin",
     "Plane",
     "PointForce",
+    "PointForces",
     "PrescribedMotion",
+    "Reactions",
     "Scene",
     "SceneError",
     "Simulation",
@@ -77,9 +81,11 @@ __all__ = [
     "VelocityVerlet",
     "WarpfemError",
     "elastic_moduli",
+    "reactions",
     "read_mesh",
     "read_surface",
     "record",
     "run",
+    "run_static",
     "tetrahedralize",
 ]

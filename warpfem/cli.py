@@ -22,6 +22,7 @@ from warpfem.checkpoint import Checkpoint, checkpoint_path
 from warpfem.errors import OutputError, SimulationError, TimeStepError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
+from warpfem.solvers import StaticEquilibrium
 
 OK, FAILED, WRONG_USE = 0, 1, 2
 
@@ -74,6 +75,7 @@ def _parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="run a scene file and store the animation", description=_run.__doc__)
     _scene_options(run)
+    _time_options(run)
     run.add_argument("--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.usdc)")
     run.add_argument(
         "--checkpoint-every",
@@ -88,12 +90,43 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else")
     run.set_defaults(command=_run)
 
+    static = commands.add_parser(
+        "static", help="solve a scene's static equilibrium and store it", description=_static.__doc__
+    )
+    _scene_options(static)
+    static.set_defaults(frames=None, fps=None)
+    static.add_argument(
+        "--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.static.usdc)"
+    )
+    static.add_argument(
+        "--time", type=float, metavar="T", help="when prescribed motions are held [s] (default: at the last frame)"
+    )
+    static.add_argument(
+        "--tolerance",
+        type=float,
+        default=StaticEquilibrium.tolerance,
+        metavar="R",
+        help="largest unbalanced force relative to the largest force that acts (default: %(default)s)",
+    )
+    static.add_argument(
+        "--load-steps",
+        type=int,
+        default=StaticEquilibrium.load_steps,
+        metavar="N",
+        help="increments of loads and motions, at least (default: 1, and more only where it needs them)",
+    )
+    static.add_argument("--overwrite", action="store_true", help="replace an output that exists, without asking")
+    static.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    static.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else")
+    static.set_defaults(command=_static)
+
     explain = commands.add_parser(
         "explain",
         help="say what a scene requires, and so what is modelled (steps it for some seconds)",
         description=_explain.__doc__,
     )
     _scene_options(explain)
+    _time_options(explain)
     explain.set_defaults(command=_explain)
 
     preview = commands.add_parser("preview", help="draw a run to PNG or GIF", description=_preview.__doc__)
@@ -136,8 +169,6 @@ _positive.__name__ = "number of frames"  # argparse's name for what is no number
 
 def _scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
-    parser.add_argument("--frames", type=int, metavar="N", help="frames to simulate after the initial one")
-    parser.add_argument("--fps", type=float, metavar="N", help="frames per second of simulated time")
     parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="default: float32")
     parser.add_argument(
@@ -148,6 +179,11 @@ def _scene_options(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="set a parameter of the scene; may be repeated",
     )
+
+
+def _time_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--frames", type=int, metavar="N", help="frames to simulate after the initial one")
+    parser.add_argument("--fps", type=float, metavar="N", help="frames per second of simulated time")
 
 
 def _load(arguments: argparse.Namespace) -> Scene:
@@ -378,6 +414,54 @@ def _summary_text(summary: Summary, simulation: Simulation) -> str:
             f"residuals of up to {summary.worst_residual:.1e}; --dtype float64 resolves more"
         )
     return "\n".join(lines)
+
+
+def _static(arguments: argparse.Namespace) -> int:
+    """Solves the static equilibrium of a scene under its loads, and stores it in a USD file.
+
+    Bodies start from their initial displacement; velocities and damping do not matter. Frame 0 of the file is the
+    start, and one frame each shows the equilibria on the way to the full load, the last one under it.
+    """
+    from warpfem.static_run import StaticRun, record_static, summary_text
+
+    _start_warp()
+    solver = StaticEquilibrium(arguments.tolerance, load_steps=arguments.load_steps)
+    scene = _load(arguments)
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.static.usdc"
+    with _held_interrupt() as check_interrupt:
+        from warpfem.usd import check_path
+    check_interrupt()
+    check_path(out)
+    if not arguments.overwrite:
+        _require_consent(out)
+    say = not (arguments.quiet or arguments.json)
+    if say:
+        print(f"{arguments.scene}: solving (the first time its kernels are compiled)", file=sys.stderr)
+    run = StaticRun(scene, solver, time=arguments.time, device=arguments.device, dtype=arguments.dtype)
+    summary = run.summary
+    code = OK
+    try:
+        with _held_interrupt() as check_interrupt, closing(record_static(run, out)) as frames:
+            for frame in frames:
+                if say and frame.index > 0:
+                    print(f"equilibrium under {100.0 * summary.fractions[-1]:.4g} % of the load", file=sys.stderr)
+                check_interrupt()
+    except KeyboardInterrupt:
+        if not summary.fractions:
+            raise
+        code = _fail(SimulationError(f"interrupted: {_kept(out)}"), FAILED)
+    except SimulationError as error:
+        if not summary.fractions:
+            raise
+        error.add_note(_kept(out))
+        code = _fail(error, FAILED)
+    if arguments.json:
+        data = {"scene": str(arguments.scene), "file": str(out), "dtype": arguments.dtype, **asdict(summary)}
+        print(json.dumps(data, indent=2))
+    elif not arguments.quiet and code == OK:
+        print(summary_text(summary))
+        print(f"wrote {out}")
+    return code
 
 
 def _explain(arguments: argparse.Namespace) -> int:

@@ -15,6 +15,7 @@ from warpfem.dtypes import FloatName
 from warpfem.errors import OutputError, SimulationError
 from warpfem.failure import failure_path, save_failure
 from warpfem.files import remove
+from warpfem.model import Model
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 
@@ -66,10 +67,10 @@ def record(
         start = Checkpoint.read(checkpoint_file)
         start.require_fit(simulation, parts, checkpoint_file)
         frame = simulation.restore(start.frame, start.time, start.displacement, start.velocity)
-        keep = start.frame, _body_frames(simulation, frame)
+        keep = start.frame, body_frames(simulation.model, frame)
     with UsdWriter(
         path,
-        _usd_bodies(scene),
+        usd_bodies(scene),
         fps=scene.fps,
         up_axis=scene.up_axis,
         obstacles=scene.obstacles,
@@ -90,7 +91,7 @@ def record(
 
         with _failure_saved(simulation, failure_file):
             for frame in simulation.frames():
-                writer.write_frame(_body_frames(simulation, frame))
+                writer.write_frame(body_frames(simulation.model, frame))
                 if checkpoint_every and frame.index % checkpoint_every == 0:
                     save_checkpoint(frame.index)
                 try:
@@ -133,7 +134,8 @@ def run(
     return simulation.summary
 
 
-def _usd_bodies(scene: Scene) -> list[UsdBody]:
+def usd_bodies(scene: Scene) -> list[UsdBody]:
+    """What the USD writer takes of the bodies."""
     from warpfem.usd import UsdBody
 
     return [
@@ -147,12 +149,13 @@ def _usd_bodies(scene: Scene) -> list[UsdBody]:
     ]
 
 
-def _body_frames(simulation: Simulation, frame: Frame) -> list[BodyFrame]:
+def body_frames(model: Model, frame: Frame) -> list[BodyFrame]:
+    """What the USD writer takes of a frame."""
     from warpfem.usd import BodyFrame
 
-    x = simulation.model.rest_points + frame.displacement
+    x = model.rest_points + frame.displacement
     frames = []
-    for body, (points, cells) in zip(simulation.scene.bodies, simulation.model.body_slices, strict=True):
+    for body, (points, cells) in zip(model.scene.bodies, model.body_slices, strict=True):
         parts = len(body.mesh.shape.parts)
         von_mises, jacobian = (np.repeat(values[cells], parts) for values in (frame.von_mises, frame.jacobian))
         frames.append(BodyFrame(x[points], frame.velocity[points], von_mises, jacobian))

@@ -15,7 +15,7 @@ import warp as wp
 from warpfem.dtypes import FloatName
 from warpfem.errors import SceneError, SimulationError, TimeStepError
 from warpfem.folds import folds
-from warpfem.model import Energies, Model
+from warpfem.model import Energies, Model, State
 from warpfem.scene import Scene
 from warpfem.solvers.base import Solver, require_finite, worst_cell
 
@@ -284,31 +284,9 @@ class Simulation:
                 summary.worst_residual, summary.worst_note = report.residual, report.note
 
     def _observe(self, index: int) -> Frame:
-        model, state = self.model, self.state
-        require_finite(model, state.u, "the displacement", state.time)
-        require_finite(model, state.v, "the velocity", state.time)
-        displacement = state.displacement
-        jacobian, von_mises = model.diagnostics(state)
-        bad = ~np.isfinite(von_mises)
-        if bad.any():
-            first = int(np.argmax(bad))
-            body, cell = model.body_of_cell(first)
-            raise SimulationError(
-                f"t = {state.time:.6g} s: the stress of cell {cell} of body '{body.name}' is not finite "
-                f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). A smaller dt, or a material that "
-                "bears inversion (StableNeoHookean), may help"
-            )
-        self._warn_of_inverted_cells(jacobian)
-        return Frame(
-            index=index,
-            time=state.time,
-            displacement=displacement,
-            velocity=state.velocity,
-            jacobian=jacobian,
-            von_mises=von_mises,
-            energies=model.energies(state),
-            penetration=0.0 if model.contact is None else model.contact.depth(displacement),
-        )
+        frame = observe(self.model, self.state, index)
+        self._warn_of_inverted_cells(frame.jacobian)
+        return frame
 
     def _warn_of_folds(self, frame: Frame) -> None:
         """Warns of bodies that had inverted cells and ended with none, but folded into themselves."""
@@ -345,3 +323,34 @@ class Simulation:
                     ),
                     stacklevel=2,
                 )
+
+
+def observe(model: Model, state: State, index: int) -> Frame:
+    """What is recorded of a state.
+
+    Raises:
+        SimulationError: it is not finite.
+    """
+    require_finite(model, state.u, "the displacement", state.time)
+    require_finite(model, state.v, "the velocity", state.time)
+    displacement = state.displacement
+    jacobian, von_mises = model.diagnostics(state)
+    bad = ~np.isfinite(von_mises)
+    if bad.any():
+        first = int(np.argmax(bad))
+        body, cell = model.body_of_cell(first)
+        raise SimulationError(
+            f"t = {state.time:.6g} s: the stress of cell {cell} of body '{body.name}' is not finite "
+            f"({int(bad.sum())} cells in all; its J is {jacobian[first]:.4g}). A smaller dt, or a material that "
+            "bears inversion (StableNeoHookean), may help"
+        )
+    return Frame(
+        index=index,
+        time=state.time,
+        displacement=displacement,
+        velocity=state.velocity,
+        jacobian=jacobian,
+        von_mises=von_mises,
+        energies=model.energies(state),
+        penetration=0.0 if model.contact is None else model.contact.depth(displacement),
+    )
