@@ -156,6 +156,24 @@ def test_a_block_stretched_to_3_and_compressed_to_03(factor, nu, dtype):
     assert across == pytest.approx(free, abs=atol)
 
 
+def test_a_clamped_block_of_quadratic_cells_compressed_to_03():
+    """Nearly incompressible, and bulging; linear cells lock, and turn unstable on the way."""
+
+    def motion(rest, time):
+        return rest * (0.3, 1.0, 1.0)
+
+    mesh = Mesh.box((1.0, 1.0, 1.0), (2, 2, 2))
+    supports = [Pin("left"), PrescribedMotion("right", motion)]
+    body = Body("block", mesh, NeoHookean(E=1e5, nu=0.49), supports=supports, element="quadratic")
+    model = Model(Scene([body], BackwardEuler()), device="cpu", dtype="float64")
+    state = model.state()
+    (*_, last) = StaticEquilibrium().increments(model, state)
+    assert last.stable and last.report.residual <= 1e-5
+    assert model.diagnostics(state)[0].min() > 0.5
+    (bulge,) = np.ptp((model.rest_points + state.displacement)[:, 1:2], axis=0)
+    assert bulge > 1.5
+
+
 def beam(tip_force):
     return Body(
         "beam",
