@@ -126,7 +126,8 @@ def _terms(simulation: Simulation) -> list[Term]:
     scene, model = simulation.scene, simulation.model
     cells: Counter[str] = Counter()
     for body in scene.bodies:
-        cells[f"{body.material.name} ({{}} {body.element} cells)"] += body.mesh.cell_count
+        kind = "cells" if body.element == "linear" else f"{body.element} cells"
+        cells[f"{body.material.name} ({{}} {kind})"] += body.mesh.cell_count
     loads = [load for body in scene.bodies for load in body.loads]
     kinds = Counter(type(obstacle).__name__ for obstacle in scene.obstacles)
     frictions = sorted({obstacle.friction for obstacle in scene.obstacles if obstacle.friction > 0.0})
