@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from warpfem.linear import Hessian
 from warpfem.model import Model, Route, State
 from warpfem.solvers.base import Stepper, StepReport, require_tolerance
-from warpfem.solvers.implicit import ImplicitSolver, ImplicitStepper, Tableau
+from warpfem.solvers.implicit import AdaptiveSolver, ImplicitStepper, Tableau
 
 
 @dataclass(frozen=True)
-class BackwardEuler(ImplicitSolver):
+class BackwardEuler(AdaptiveSolver):
     """Backward Euler, v = (u - u_t)/dt and M (v - v_t)/dt = f(u) at the end of the step.
 
     By default each step is solved to ``tolerance`` by Newton's method with line search on the incremental

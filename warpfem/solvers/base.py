@@ -30,6 +30,7 @@ class StepReport:
             rounding. A linearised step has solved its system and has not raised the potential.
         rounded: whether rounding hides what is left of the residual, so that no other step would do better.
         parts: steps that this one was divided into.
+        error: estimate of the error of the step over what its target allows; 0 without a target.
         note: how the step ended, if not by its tolerance.
     """
 
@@ -39,6 +40,7 @@ class StepReport:
     converged: bool = True
     rounded: bool = False
     parts: int = 1
+    error: float = 0.0
     note: str = ""
 
     def __add__(self, other: StepReport) -> StepReport:
@@ -74,6 +76,14 @@ class Stepper(ABC):
             SimulationError: the step cannot be taken, and the state is as it was before; or an explicit run has
                 blown up, and the state shows it.
         """
+
+    def try_step(self, state: State, dt: float) -> StepReport:
+        """Advances ``state`` by ``dt`` [s] if the error of the step is within its target, else leaves it as it was.
+
+        Raises:
+            SimulationError: the step cannot be taken as a whole, and the state is as it was before.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not estimate errors")
 
     @abstractmethod
     def arrays(self) -> list[wp.array]:

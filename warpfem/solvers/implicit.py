@@ -10,12 +10,15 @@ and d~ = h v_b / (1 + alpha h). Friction is that of the stage's velocity.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from math import factorial
 from typing import ClassVar, Literal
 
 import numpy as np
 import warp as wp
 
-from warpfem.errors import SimulationError
+from warpfem.boundary import is_number
+from warpfem.errors import SceneError, SimulationError
 from warpfem.model import Model, State
 from warpfem.solvers.base import (
     Solver,
@@ -26,6 +29,7 @@ from warpfem.solvers.base import (
     require_positive,
     worst_cell,
 )
+from warpfem.solvers.error_control import ErrorNorm
 from warpfem.solvers.newton import Newton, NewtonSettings, require_choice
 
 MAX_HALVINGS = 10
@@ -44,6 +48,21 @@ class Tableau:
     rows: tuple[tuple[float, ...], ...]
     weights: tuple[float, ...] | None = None
 
+    @cached_property
+    def error_weights(self) -> tuple[float, ...]:
+        """e_0 for v_t and e_j for each stage: dt times the sum of e_j v_j estimates the error of the displacements.
+
+        It is how the scheme differs from the quadrature of these s + 1 velocities that is exact to order s + 1 for
+        linear motion: sum_j b_j (A^k 1)_j = 1 / (k + 1)! for k = 0..s, where node 0 is the start of the step.
+        """
+        count = len(self.rows) + 1
+        A = np.zeros((count, count))
+        for index, row in enumerate(self.rows, start=1):
+            A[index, 1 : index + 1] = row
+        powers = [np.linalg.matrix_power(A, k).sum(axis=1) for k in range(count)]
+        higher = np.linalg.solve(powers, [1.0 / factorial(k + 1) for k in range(count)])
+        return tuple(higher - (A[-1] if self.weights is None else (0.0, *self.weights)))
+
 
 @dataclass(frozen=True)
 class ImplicitSolver(NewtonSettings, Solver):
@@ -58,6 +77,7 @@ class ImplicitSolver(NewtonSettings, Solver):
     unconverged: Literal["halve", "accept"] = "halve"
 
     tableau: ClassVar[Tableau]
+    error: ClassVar[float | None] = None
     least_iterations: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
@@ -67,6 +87,23 @@ class ImplicitSolver(NewtonSettings, Solver):
 
     def stepper(self, model: Model) -> Stepper:
         return ImplicitStepper(model, self)
+
+
+@dataclass(frozen=True)
+class AdaptiveSolver(ImplicitSolver):
+    """Settings of implicit schemes that can choose their steps.
+
+    Attributes:
+        error: error of the displacements that a second of simulated time may add, relative to the body's size
+            [1/s]: steps with ``dt="auto"`` are then as long as that allows. ``None`` leaves dt as it is given.
+    """
+
+    error: float | None = None  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.error is not None and not (is_number(self.error) and self.error > 0.0):
+            raise SceneError(f"{type(self).__name__}: error must be a finite number > 0, or None, not {self.error!r}")
 
 
 class ImplicitStepper(Stepper):
@@ -82,10 +119,12 @@ class ImplicitStepper(Stepper):
         self._rates = [(model.zeros(), model.zeros()) for _ in range(kept)]  # v_j and a_j of the stages
         self._base = (model.zeros(), model.zeros()) if len(tableau.rows) > 1 else None
         self._end = None if self._ends_with_stage else model.zeros()
+        self._norm = None if config.error is None else ErrorNorm(model)
 
     def arrays(self) -> list[wp.array]:
         own = [array for pair in self._rates for array in pair]
         own += [*(self._base or ()), *([] if self._end is None else [self._end])]
+        own += [] if self._norm is None else self._norm.arrays()
         return [*own, *self.newton.arrays()]
 
     def prepare(self, state: State, dt: float) -> None:
@@ -102,6 +141,10 @@ class ImplicitStepper(Stepper):
             if self.config.unconverged == "accept" or hopeless:
                 raise
             return self._step_in_parts(state, dt, failure)
+
+    def try_step(self, state: State, dt: float) -> StepReport:
+        require_positive(dt)
+        return self._single_step(state, dt, most_error=1.0)
 
     def _step_in_parts(self, state: State, dt: float, failure: SimulationError) -> StepReport:
         """Two steps of half the length, and so on where one fails; puts the state back if the last one does."""
@@ -131,8 +174,8 @@ class ImplicitStepper(Stepper):
         state.time = start.time + dt
         return report
 
-    def _single_step(self, state: State, dt: float) -> StepReport:
-        """One step, by which ``state`` changes only if it succeeds.
+    def _single_step(self, state: State, dt: float, most_error: float = np.inf) -> StepReport:
+        """One step, by which ``state`` changes only if it succeeds, with no more than the error allowed.
 
         Raises:
             SimulationError: it does not.
@@ -152,7 +195,7 @@ class ImplicitStepper(Stepper):
                 self._scale(1.0 / h, velocity, acceleration)
                 newton.potential.add_scaled(acceleration, -1.0 / h, base_v, acceleration)
         assert report is not None
-        return self._finish(state, dt, h, report)
+        return self._finish(state, dt, h, report, most_error)
 
     def _stage_base(self, state: State, dt: float, row: tuple[float, ...]) -> tuple[wp.array, wp.array]:
         """u_b and v_b."""
@@ -184,7 +227,7 @@ class ImplicitStepper(Stepper):
             require_finite(self.model, state.v, "the velocity", state.time)
         return newton.minimise(value, time)
 
-    def _finish(self, state: State, dt: float, h: float, report: StepReport) -> StepReport:
+    def _finish(self, state: State, dt: float, h: float, report: StepReport, most_error: float) -> StepReport:
         """Puts the state at the end of the step, of which the last stage was ``h`` long, if that is good."""
         model, potential = self.model, self.newton.potential
         u, way = self.newton.u, self.newton.d
@@ -206,6 +249,10 @@ class ImplicitStepper(Stepper):
             raise SimulationError(
                 f"{report.note}, with a residual of {report.residual:.1e}; {worst_cell(model, self.newton.u)}"
             )
+        if self._norm is not None:
+            report = replace(report, error=self._estimate_error(state, dt, h))
+            if not report.error <= most_error:
+                return report
         if self._end is None:
             self._scale(1.0 / h, self.newton.d, state.v)
         else:
@@ -217,6 +264,18 @@ class ImplicitStepper(Stepper):
         state.time += dt
         state.revision += 1
         return report
+
+    def _estimate_error(self, state: State, dt: float, h: float) -> float:
+        """The estimate of the step's error over what the target allows for ``dt``."""
+        potential, error = self.newton.potential, self.newton.potential.part
+        first, *others, last = self.config.tableau.error_weights
+        self._scale(first * dt, state.v, error)
+        for weight, (velocity, _) in zip(others, self._rates, strict=True):
+            potential.add_scaled(error, weight * dt, velocity, error)
+        potential.add_scaled(error, last * dt / h, self.newton.d, error)
+        if self.model.supports is not None:
+            self.model.supports.project(error)
+        return self._norm(error) / (self.config.error * dt)
 
     def _require_uninverted(self, u: wp.array) -> None:
         """Raises SimulationError where a material that does not bear inversion has it at ``u``."""
