@@ -37,11 +37,22 @@ from warpfem.reactions import PointForces, Reactions, reactions
 from warpfem.record import record, run
 from warpfem.scene import Body, Scene
 from warpfem.simulation import Frame, Simulation, Summary
-from warpfem.solvers import SOLVERS, BackwardEuler, StaticEquilibrium, SymplecticEuler, VelocityVerlet
+from warpfem.solvers import (
+    SDIRK2,
+    SDIRK3,
+    SOLVERS,
+    BackwardEuler,
+    ImplicitMidpoint,
+    StaticEquilibrium,
+    SymplecticEuler,
+    VelocityVerlet,
+)
 from warpfem.static_run import run_static
 
 __all__ = [
     "MATERIALS",
+    "SDIRK2",
+    "SDIRK3",
     "SOLVERS",
     "BackwardEuler",
     "Body",
@@ -51,6 +62,7 @@ __all__ = [
     "EnergyMaterial",
     "FixedCorotated",
     "Frame",
+    "ImplicitMidpoint",
     "LinearElasticity",
     "MaterialError",
     "Mesh",

@@ -383,8 +383,11 @@ def _summary_data(summary: Summary, arguments: argparse.Namespace, out: Path) ->
 
 
 def _summary_text(summary: Summary, simulation: Simulation) -> str:
+    same = summary.longest_dt - summary.shortest_dt <= 1e-6 * summary.longest_dt
+    length = f"{summary.dt:.4g} s" if same else f"{summary.shortest_dt:.4g} to {summary.longest_dt:.4g} s"
+    rejected = f" ({summary.rejected_steps} more were tried and not taken)" if summary.rejected_steps else ""
     lines = [
-        f"{summary.frames} frames, {summary.steps} steps of {summary.dt:.4g} s, "
+        f"{summary.frames} frames, {summary.steps} steps of {length}{rejected}, "
         f"{summary.simulated_seconds:.3f} s simulated",
         f"wall time: {summary.setup_seconds:.2f} s to prepare, {summary.stepping_seconds:.2f} s to step",
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -93,29 +94,30 @@ def explain(scene: Scene, *, device: str | None = None, dtype: FloatName = "floa
     with observe_launches(device) as set_up:
         simulation = Simulation(scene, device=device, dtype=dtype)
     model, stepper, state = simulation.model, simulation.stepper, simulation.state
-    steps, wanted = 0, max(1, scene.frames * simulation.steps_per_frame)
+    end, summary = max(1, scene.frames) / scene.fps, simulation.summary
     with observe_launches(model.device) as seen:
         start = time.perf_counter()
-        while steps < wanted and time.perf_counter() - start < OBSERVED_SECONDS:
-            stepper.step(state, simulation.dt)
-            steps += 1
+        while state.time < end - 1e-9 / scene.fps and time.perf_counter() - start < OBSERVED_SECONDS:
+            frames_done = math.floor(state.time * scene.fps + 1e-9)
+            simulation.step_towards((frames_done + 1) / scene.fps)
         seconds = time.perf_counter() - start
     limit = stepper.stable_dt()
-    stability = "no stability limit" if limit is None else f"stable below {limit:.4g} s at rest"
+    if stepper.controls_error:
+        dt = f"dt follows the error target: {summary.shortest_dt:.4g} to {summary.longest_dt:.4g} s in the steps seen"
+    else:
+        stability = "no stability limit" if limit is None else f"stable below {limit:.4g} s at rest"
+        dt = f"dt = {simulation.dt:.4g} s, {simulation.steps_per_frame} steps per frame, {stability}"
     bodies = f"{len(scene.bodies)} bodies" if len(scene.bodies) > 1 else "1 body"
     return Explanation(
         headline=(
             f"{scene.dim}D, {bodies}, {model.point_count} points, {model.cell_count} cells, "
             f"{model.dtype} on {model.device}"
         ),
-        stepping=(
-            f"{simulation.solver!r}\n"
-            f"dt = {simulation.dt:.4g} s, {simulation.steps_per_frame} steps per frame, {stability}"
-        ),
+        stepping=f"{simulation.solver!r}\n{dt}",
         terms=_terms(simulation),
         kernels=list(seen.kernels.values()),
         other_kernels=[use for key, use in set_up.kernels.items() if key not in seen.kernels],
-        steps=steps,
+        steps=summary.steps,
         seconds=seconds,
         model_bytes=device_bytes([*model.arrays(), state.u, state.v]),
         solver_bytes=device_bytes(stepper.arrays()),

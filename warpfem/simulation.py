@@ -17,7 +17,8 @@ from warpfem.errors import SceneError, SimulationError, TimeStepError
 from warpfem.folds import folds
 from warpfem.model import Energies, Model, State
 from warpfem.scene import Scene
-from warpfem.solvers.base import Solver, require_finite, worst_cell
+from warpfem.solvers.base import Solver, StepReport, require_finite, worst_cell
+from warpfem.solvers.error_control import controlled_step
 
 AUTO_FRACTION = 0.6
 """The part of the explicit stability limit that ``dt="auto"`` takes: deformation stiffens cells."""
@@ -65,6 +66,9 @@ class Summary:
         frames: frames recorded, the initial one included.
         steps: time steps taken.
         dt: time step [s]; with ``dt="auto"`` the last one.
+        shortest_dt, longest_dt: of the steps taken [s]; 0 before the first.
+        wanted_dt: the length that the next step of a solver with an error target should have [s].
+        rejected_steps: steps that missed the error target, or failed, and were not taken.
         stable_dt: the explicit stability limit that ``dt="auto"`` saw last [s].
         simulated_seconds: simulated time [s].
         setup_seconds: wall time to build the model, and to compile or load its kernels [s].
@@ -87,6 +91,10 @@ class Summary:
     dt: float
     setup_seconds: float
     stable_dt: float | None = None
+    wanted_dt: float | None = None
+    shortest_dt: float = 0.0
+    longest_dt: float = 0.0
+    rejected_steps: int = 0
     frames: int = 0
     steps: int = 0
     simulated_seconds: float = 0.0
@@ -146,7 +154,8 @@ class Simulation:
         model: the scene on the device.
         solver: the solver.
         state: the current state.
-        dt: the time step [s]; explicit steps with ``dt="auto"`` change it as the bodies deform.
+        dt: the time step [s]; explicit steps with ``dt="auto"`` change it as the bodies deform, and solvers with an
+            error target as the motion asks for.
         steps_per_frame: time steps between two frames, likewise.
         summary: what has been done so far.
 
@@ -183,12 +192,15 @@ class Simulation:
                 f"a frame of {interval:.3g} s would take {self.steps_per_frame:.3g} steps of {self.dt:.3g} s: raise "
                 "fps, or take BackwardEuler with a longer dt"
             )
+        if self.stepper.controls_error and scene.dt != "auto":
+            raise SceneError(f'{type(self.solver).__name__} with an error target chooses dt: take dt="auto"')
         if scene.frames > 0:
             self.stepper.prepare(self.state, self.dt)
         self._observe(0)
         self._first = 0
         self._begun = False
-        self.summary = Summary(self.dt, time.perf_counter() - start, self._rest_limit)
+        wanted_dt = interval if self.stepper.controls_error else None
+        self.summary = Summary(self.dt, time.perf_counter() - start, self._rest_limit, wanted_dt)
 
     def restore(self, index: int, time: float, displacement: np.ndarray, velocity: np.ndarray) -> Frame:
         """Takes the state of an earlier run at a frame: :meth:`frames` then goes on with the next one.
@@ -241,20 +253,40 @@ class Simulation:
 
     def _advance(self, end: float) -> None:
         """Steps to the end of a frame."""
-        if self._rest_limit is None:
+        if self._rest_limit is None and not self.stepper.controls_error:
             for _ in range(self.steps_per_frame):
                 self._step()
             self.state.time = end  # without the rounding of many steps
             return
-        summary, interval = self.summary, 1.0 / self.scene.fps
-        while (left := end - self.state.time) > 1e-9 * interval:
+        while end - self.state.time > 1e-9 / self.scene.fps:
+            self.step_towards(end)
+
+    def step_towards(self, end: float) -> None:
+        """Takes the next step, of the length that the scene asks for, but not beyond the time ``end`` [s].
+
+        Raises:
+            SimulationError: the run cannot go on.
+        """
+        summary, interval, left = self.summary, 1.0 / self.scene.fps, end - self.state.time
+        if self.stepper.controls_error:
+            assert summary.wanted_dt is not None
+            step = controlled_step(self.stepper, self.solver.order, self.state, left, summary.wanted_dt, interval)
+            summary.wanted_dt = step.wanted
+            summary.rejected_steps += step.rejected
+            self._set_dt(step.dt)
+            self._count(step.report)
+            return
+        if self._rest_limit is not None:
             if summary.steps % AUTO_INTERVAL == 0:
                 self._follow_limit()
             assert summary.stable_dt is not None
             parts = math.ceil(left / (AUTO_FRACTION * summary.stable_dt) - 1e-9)
-            self.dt = summary.dt = left / parts
-            self.steps_per_frame = math.ceil(interval / self.dt - 1e-9)
-            self._step()
+            self._set_dt(left / parts)
+        self._step()
+
+    def _set_dt(self, dt: float) -> None:
+        self.dt = self.summary.dt = dt
+        self.steps_per_frame = math.ceil(1.0 / self.scene.fps / dt - 1e-9)
 
     def _follow_limit(self) -> None:
         """Estimates the stability limit again; it grows slowly, and never beyond that at rest."""
@@ -270,8 +302,13 @@ class Simulation:
             )
 
     def _step(self) -> None:
+        self._count(self.stepper.step(self.state, self.dt))
+
+    def _count(self, report: StepReport) -> None:
+        """Takes a step of the current length into account."""
         summary = self.summary
-        report = self.stepper.step(self.state, self.dt)
+        summary.shortest_dt = min(self.dt, summary.shortest_dt or self.dt)
+        summary.longest_dt = max(self.dt, summary.longest_dt)
         summary.steps += 1
         summary.simulated_seconds = self.state.time
         summary.newton_iterations += report.newton_iterations

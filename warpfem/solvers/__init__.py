@@ -3,17 +3,20 @@
 from warpfem.solvers.backward_euler import BackwardEuler
 from warpfem.solvers.base import Solver, Stepper, StepReport
 from warpfem.solvers.explicit import SymplecticEuler, VelocityVerlet
-from warpfem.solvers.runge_kutta import SDIRK2, ImplicitMidpoint
+from warpfem.solvers.runge_kutta import SDIRK2, SDIRK3, ImplicitMidpoint
 from warpfem.solvers.static import StaticEquilibrium
 
 SOLVERS: dict[str, type[Solver]] = {
-    solver.name: solver for solver in (SymplecticEuler, VelocityVerlet, BackwardEuler, ImplicitMidpoint, SDIRK2)
+    solver.name: solver for solver in (SymplecticEuler, VelocityVerlet, BackwardEuler, ImplicitMidpoint, SDIRK2, SDIRK3)
 }
 """The solvers by name."""
 
 __all__ = [
+    "SDIRK2",
+    "SDIRK3",
     "SOLVERS",
     "BackwardEuler",
+    "ImplicitMidpoint",
     "Solver",
     "StaticEquilibrium",
     "StepReport",

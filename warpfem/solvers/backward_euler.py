@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass
 
+import warp as wp
+
 from warpfem.linear import Hessian
 from warpfem.model import Model, Route, State
 from warpfem.solvers.base import Stepper, StepReport, require_tolerance
-from warpfem.solvers.implicit import AdaptiveSolver, ImplicitStepper, Tableau
+from warpfem.solvers.implicit import ImplicitSolver, ImplicitStepper, Tableau
 
 
 @dataclass(frozen=True)
-class BackwardEuler(AdaptiveSolver):
+class BackwardEuler(ImplicitSolver):
     """Backward Euler, v = (u - u_t)/dt and M (v - v_t)/dt = f(u) at the end of the step.
 
     By default each step is solved to ``tolerance`` by Newton's method with line search on the incremental
@@ -57,7 +59,7 @@ class BackwardEuler(AdaptiveSolver):
 class _LinearisedStepper(ImplicitStepper):
     config: BackwardEuler
 
-    def _solve(self, state: State, time: float, first: bool) -> StepReport:
+    def _solve(self, state: State, acceleration: wp.array | None, time: float) -> StepReport:
         contact, potential = self.model.contact, self.newton.potential
         if contact is not None:
             potential.add_scaled(state.u, 1.0, potential.predicted, potential.part)

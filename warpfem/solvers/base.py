@@ -62,11 +62,13 @@ class Stepper(ABC):
         attempt: displacements at which the last step failed, device array, where there are other than the state's.
         adaptive: whether dt is chosen by :meth:`estimate_stable_dt`: then a dt above the limit of the moment is not
             refused, since the next one will be shorter.
+        controls_error: whether dt shall follow the errors that :meth:`try_step` estimates.
     """
 
     model: Model
     attempt: wp.array | None = None
     adaptive: bool = False
+    controls_error: bool = False
 
     @abstractmethod
     def step(self, state: State, dt: float) -> StepReport:

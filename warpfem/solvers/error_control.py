@@ -1,5 +1,8 @@
 """Steps of implicit schemes that are as long as an error target allows."""
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
@@ -49,53 +52,59 @@ class ErrorNorm:
         return largest
 
 
-class ErrorControl:
-    """Chooses the steps of a stepper that estimates their errors.
-
-    The estimate of a step falls with its length to the power order + 1, and the target allows an error in
-    proportion to the length: the next step is the last times (1 / ratio)^(1 / order), ``SAFETY`` apart.
+@dataclass(frozen=True)
+class ControlledStep:
+    """A step whose length an error target chose.
 
     Attributes:
-        stepper: the stepper; its reports' ``error`` is the estimate over what the target allows.
-        order: that of the scheme.
-        longest: the longest step [s].
-        wanted: the length of the next step [s]. All that has to be known to go on as if nothing had been.
-        rejected: steps that were tried and not taken.
+        report: what it did.
+        dt: its length [s].
+        wanted: the length that the next one should have [s].
+        rejected: steps that were tried before and not taken.
     """
 
-    def __init__(self, stepper: Stepper, order: int, longest: float) -> None:
-        self.stepper = stepper
-        self.order = order
-        self.longest = longest
-        self.wanted = longest
-        self.rejected = 0
+    report: StepReport
+    dt: float
+    wanted: float
+    rejected: int
 
-    def step(self, state: State, left: float) -> tuple[StepReport, float]:
-        """Advances ``state`` by the longest good step that divides the time ``left`` [s].
 
-        Returns:
-            The report and the length of the step [s].
+def controlled_step(
+    stepper: Stepper, order: int, state: State, left: float, wanted: float, longest: float
+) -> ControlledStep:
+    """Advances ``state`` by the longest step that its error target allows.
 
-        Raises:
-            SimulationError: none is good; the state is as it was before.
-        """
+    The estimate grows with the length of a step to the power order + 1, and the target allows an error in proportion
+    to the length: the next step is the last times (1 / error)^(1 / order), ``SAFETY`` apart.
+
+    Args:
+        stepper: estimates the errors of its steps.
+        order: that of the scheme.
+        state: the state.
+        left: time that steps of the same length shall divide [s].
+        wanted: length to try first [s].
+        longest: the longest step [s].
+
+    Raises:
+        SimulationError: no step is good; the state is as it was before.
+    """
+    least, most = LARGEST_CHANGE
+    rejected = 0
+    while True:
+        dt = left / math.ceil(left / wanted - 1e-9)
         failure: SimulationError | None = None
-        while self.wanted > LEAST_PART * self.longest:
-            dt = left / np.ceil(left / self.wanted - 1e-9)
-            try:
-                report = self.stepper.try_step(state, dt)
-            except SimulationError as error:
-                failure = error
-                self.wanted = 0.5 * dt
-            else:
-                failure = None
-                least, most = LARGEST_CHANGE
-                change = SAFETY * report.error ** (-1.0 / self.order) if report.error > 0.0 else most
-                self.wanted = min(self.longest, dt * min(max(change, least), most))
-                if report.error <= 1.0:
-                    return report, dt
-            self.rejected += 1
-        raise SimulationError(
-            f"t = {state.time:.6g} s: no step of more than {self.wanted:.3g} s "
-            + (f"can be solved: {failure}" if failure else "meets the error target: take a larger one, or a fixed dt")
-        ) from failure
+        try:
+            report = stepper.try_step(state, dt)
+        except SimulationError as error:
+            failure, wanted = error, 0.5 * dt
+        else:
+            change = SAFETY * report.error ** (-1.0 / order) if report.error > 0.0 else most
+            wanted = min(longest, dt * min(max(change, least), most))
+            if report.error <= 1.0:
+                return ControlledStep(report, dt, wanted, rejected)
+        rejected += 1
+        if not wanted > LEAST_PART * longest:
+            raise SimulationError(
+                f"t = {state.time:.6g} s: no step of more than {wanted:.3g} s "
+                + (f"can be solved: {failure}" if failure else "meets the error target: take a larger one")
+            ) from failure

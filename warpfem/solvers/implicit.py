@@ -17,8 +17,7 @@ from typing import ClassVar, Literal
 import numpy as np
 import warp as wp
 
-from warpfem.boundary import is_number
-from warpfem.errors import SceneError, SimulationError
+from warpfem.errors import SimulationError
 from warpfem.model import Model, State
 from warpfem.solvers.base import (
     Solver,
@@ -77,7 +76,6 @@ class ImplicitSolver(NewtonSettings, Solver):
     unconverged: Literal["halve", "accept"] = "halve"
 
     tableau: ClassVar[Tableau]
-    error: ClassVar[float | None] = None
     least_iterations: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
@@ -89,27 +87,17 @@ class ImplicitSolver(NewtonSettings, Solver):
         return ImplicitStepper(model, self)
 
 
-@dataclass(frozen=True)
-class AdaptiveSolver(ImplicitSolver):
-    """Settings of implicit schemes that can choose their steps.
+class ImplicitStepper(Stepper):
+    """Steps by a tableau, in parts where a step fails.
 
-    Attributes:
-        error: error of the displacements that a second of simulated time may add, relative to the body's size
-            [1/s]: steps with ``dt="auto"`` are then as long as that allows. ``None`` leaves dt as it is given.
+    Args:
+        model: the model.
+        config: the scheme and its settings.
+        error: what a second of simulated time may add to the error of the displacements, relative to the body's size
+            [1/s]; ``None`` estimates no errors.
     """
 
-    error: float | None = None  # type: ignore[misc]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.error is not None and not (is_number(self.error) and self.error > 0.0):
-            raise SceneError(f"{type(self).__name__}: error must be a finite number > 0, or None, not {self.error!r}")
-
-
-class ImplicitStepper(Stepper):
-    """Steps by a tableau, in parts where a step fails."""
-
-    def __init__(self, model: Model, config: ImplicitSolver) -> None:
+    def __init__(self, model: Model, config: ImplicitSolver, error: float | None = None) -> None:
         self.model = model
         self.config = config
         self.newton = Newton(model, config)
@@ -119,7 +107,9 @@ class ImplicitStepper(Stepper):
         self._rates = [(model.zeros(), model.zeros()) for _ in range(kept)]  # v_j and a_j of the stages
         self._base = (model.zeros(), model.zeros()) if len(tableau.rows) > 1 else None
         self._end = None if self._ends_with_stage else model.zeros()
-        self._norm = None if config.error is None else ErrorNorm(model)
+        self.error = error
+        self.controls_error = error is not None
+        self._norm = ErrorNorm(model) if self.controls_error else None
 
     def arrays(self) -> list[wp.array]:
         own = [array for pair in self._rates for array in pair]
@@ -144,7 +134,12 @@ class ImplicitStepper(Stepper):
 
     def try_step(self, state: State, dt: float) -> StepReport:
         require_positive(dt)
-        return self._single_step(state, dt, most_error=1.0)
+        self.attempt = None
+        try:
+            return self._single_step(state, dt, most_error=1.0)
+        except SimulationError:
+            self.attempt = self.newton.u
+            raise
 
     def _step_in_parts(self, state: State, dt: float, failure: SimulationError) -> StepReport:
         """Two steps of half the length, and so on where one fails; puts the state back if the last one does."""
@@ -187,7 +182,8 @@ class ImplicitStepper(Stepper):
         for index, row in enumerate(tableau.rows):
             h = row[-1] * dt
             base_u, base_v = self._stage_base(state, dt, row)
-            stage = self._stage(state, base_u, base_v, state.time + sum(row) * dt, h, dt, first=index == 0)
+            acceleration = self._rates[index - 1][1] if index else None
+            stage = self._stage(state, base_u, base_v, acceleration, state.time + sum(row) * dt, h, dt)
             report = stage if report is None else replace(report + stage, parts=1)
             if index < len(self._rates):
                 velocity, acceleration = self._rates[index]
@@ -208,20 +204,31 @@ class ImplicitStepper(Stepper):
         return u, v
 
     def _stage(
-        self, state: State, u: wp.array, v: wp.array, time: float, h: float, dt: float, first: bool
+        self,
+        state: State,
+        base_u: wp.array,
+        base_v: wp.array,
+        acceleration: wp.array | None,
+        time: float,
+        h: float,
+        dt: float,
     ) -> StepReport:
-        """Solves a stage of length ``h`` from ``u`` and ``v``, which ends at ``time``."""
-        model, newton = self.model, self.newton
+        """Solves a stage of length ``h`` from ``base_u`` and ``base_v``, which ends at ``time``.
+
+        ``acceleration`` is that of the stage before.
+        """
+        model, potential = self.model, self.newton.potential
         damping = model.scene.damping
-        newton.potential.pose(u, (1.0 + damping * h) / h**2, h)
-        self._scale(h / (1.0 + damping * h), v, newton.potential.predicted)
+        potential.pose(base_u, (1.0 + damping * h) / h**2, h)
+        self._scale(h / (1.0 + damping * h), base_v, potential.predicted)
         if model.supports is not None:
             model.supports.advance(time, dt)
-        return self._solve(state, time, first)
+        return self._solve(state, acceleration, time)
 
-    def _solve(self, state: State, time: float, first: bool) -> StepReport:
+    def _solve(self, state: State, acceleration: wp.array | None, time: float) -> StepReport:
         newton = self.newton
-        value = newton.start_in_flight(newton.start_at_base() if first else newton.start_where_it_is())
+        standing = newton.start_at_base() if acceleration is None else newton.start_where_it_is()
+        value = newton.start_in_flight(standing, acceleration)
         if not np.isfinite(value):
             require_finite(self.model, state.u, "the displacement", state.time)
             require_finite(self.model, state.v, "the velocity", state.time)
@@ -275,7 +282,7 @@ class ImplicitStepper(Stepper):
         potential.add_scaled(error, last * dt / h, self.newton.d, error)
         if self.model.supports is not None:
             self.model.supports.project(error)
-        return self._norm(error) / (self.config.error * dt)
+        return self._norm(error) / (self.error * dt)
 
     def _require_uninverted(self, u: wp.array) -> None:
         """Raises SimulationError where a material that does not bear inversion has it at ``u``."""

@@ -175,10 +175,12 @@ class IncrementalPotential:
         if self.model.supports is not None:
             self.model.supports.hold(u_out, self.part)  # the rates go to a work array
 
-    def fly(self, increment_out: wp.array) -> None:
-        """Writes how far inertia and dead loads alone would take the points, zero where held."""
+    def fly(self, increment_out: wp.array, acceleration: wp.array | None = None) -> None:
+        """Writes how far inertia and an acceleration, or else dead loads, would take the points, zero where held."""
         model = self.model
-        if model.dead_load is None:
+        if acceleration is not None:
+            self.add_scaled(self.predicted, 1.0 / self.weight, acceleration, increment_out)
+        elif model.dead_load is None:
             wp.copy(increment_out, self.predicted)
         else:
             arguments = [self.predicted, model.dead_load, model.inverse_mass, 1.0 / self.weight]

@@ -122,10 +122,18 @@ class Newton:
         self.potential.move(self.d, self.u)
         return self.potential.value(self.d, self.u)
 
-    def start_in_flight(self, standing: float) -> float:
-        """Starts from free flight instead, if that has less potential than ``standing`` and can be reached."""
+    def start_in_flight(self, standing: float, acceleration: wp.array | None = None) -> float:
+        """Starts from free flight instead, if that has less potential than ``standing`` and can be reached.
+
+        Args:
+            standing: the potential of the start that has been chosen [J].
+            acceleration: what it is expected to be, device array [m/s^2]; ``None`` for that of dead loads alone.
+
+        Returns:
+            The potential of the start [J].
+        """
         potential = self.potential
-        potential.fly(self._trial_d)
+        potential.fly(self._trial_d, acceleration)
         potential.move(self._trial_d, self._trial)
         flying = potential.value(self._trial_d, self._trial)
         if (flying < standing or not np.isfinite(standing)) and not self._trial_is_behind_an_obstacle():
