@@ -9,12 +9,24 @@ from warpfem.materials import LinearElasticity, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.model import Model, State
 from warpfem.scene import Body, Scene
-from warpfem.solvers import BackwardEuler, Solver, Stepper, StepReport, SymplecticEuler, VelocityVerlet
+from warpfem.solvers import (
+    SDIRK2,
+    SDIRK3,
+    BackwardEuler,
+    ImplicitMidpoint,
+    Solver,
+    Stepper,
+    StepReport,
+    SymplecticEuler,
+    VelocityVerlet,
+)
 
 EXPLICIT = [SymplecticEuler(), VelocityVerlet()]
 TIGHT = BackwardEuler(tolerance=1e-10)
 LINEARISED = BackwardEuler.linearised(linear_tolerance=1e-13)
-SOLVERS = [*EXPLICIT, TIGHT, LINEARISED]
+MIDPOINT = ImplicitMidpoint(tolerance=1e-10)
+SDIRK = [SDIRK2(tolerance=1e-10), SDIRK3(tolerance=1e-10)]
+SOLVERS = [*EXPLICIT, TIGHT, LINEARISED, MIDPOINT, *SDIRK]
 
 
 def solver_name(solver: Solver) -> str:

@@ -33,6 +33,9 @@ WALL_TIMES = ("setup_seconds", "stepping_seconds")
 SOLVERS = {
     "backward_euler": wf.BackwardEuler(),
     "linearised": wf.BackwardEuler.linearised(),
+    "implicit_midpoint": wf.ImplicitMidpoint(),
+    "sdirk3": wf.SDIRK3(),
+    "error target": wf.SDIRK2(error=1e-2),
     "velocity_verlet": wf.VelocityVerlet(),
     "symplectic_euler": wf.SymplecticEuler(),
 }

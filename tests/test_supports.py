@@ -9,9 +9,9 @@ from warpfem.errors import SceneError
 from warpfem.mesh import Mesh
 from warpfem.model import Model
 from warpfem.scene import Body, Scene
-from warpfem.solvers import BackwardEuler, SymplecticEuler
+from warpfem.solvers import SDIRK2, BackwardEuler, ImplicitMidpoint, SymplecticEuler
 
-SOLVERS = [*EXPLICIT, BackwardEuler(), LINEARISED]
+SOLVERS = [*EXPLICIT, BackwardEuler(), LINEARISED, ImplicitMidpoint(), SDIRK2()]
 GRAVITY = (1.0, -9.0, 2.0)
 
 
