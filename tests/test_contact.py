@@ -11,10 +11,10 @@ from warpfem.materials import LinearElasticity, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.model import Model
 from warpfem.scene import Body, Scene
-from warpfem.solvers import BackwardEuler, SymplecticEuler, VelocityVerlet
+from warpfem.solvers import SDIRK2, BackwardEuler, SymplecticEuler, VelocityVerlet
 
 G = 10.0
-STEPS = {SymplecticEuler(): 1e-3, VelocityVerlet(): 1e-3, BackwardEuler(): 1e-2, LINEARISED: 1e-2}
+STEPS = {SymplecticEuler(): 1e-3, VelocityVerlet(): 1e-3, BackwardEuler(): 1e-2, LINEARISED: 1e-2, SDIRK2(): 1e-2}
 FAMILIES = [SymplecticEuler(), BackwardEuler()]
 
 

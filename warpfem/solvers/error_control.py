@@ -32,7 +32,7 @@ class ErrorNorm:
         self._kernel = point_kernels(model.dim, model.dtype).kinetic_energy
         self._sum = wp.zeros(1, dtype=wp.float64, device=model.device)
         self._scales = [
-            0.5 * model.host_mass[points].sum() * float(np.sum(np.ptp(body.mesh.bounding_box, axis=0) ** 2))
+            float(0.5 * model.host_mass[points].sum() * np.sum(np.ptp(body.mesh.bounding_box, axis=0) ** 2))
             for body, (points, _) in zip(model.scene.bodies, model.body_slices, strict=True)
         ]
 
@@ -104,7 +104,7 @@ def controlled_step(
                 return ControlledStep(report, dt, wanted, rejected)
         rejected += 1
         if not wanted > LEAST_PART * longest:
-            raise SimulationError(
-                f"t = {state.time:.6g} s: no step of more than {wanted:.3g} s "
-                + (f"can be solved: {failure}" if failure else "meets the error target: take a larger one")
-            ) from failure
+            why = f"can be solved: {failure}" if failure else "meets the error target: take a larger one"
+            if failure is None and report.rounded:
+                why += f", or a higher precision, since steps are {report.note}"
+            raise SimulationError(f"t = {state.time:.6g} s: no step of more than {wanted:.3g} s {why}") from failure
