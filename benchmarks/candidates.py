@@ -163,18 +163,7 @@ class GeneralisedAlpha(_Candidate):
         return _GeneralisedAlphaStepper(model, self)
 
 
-_G = 0.43586652150845899942
 _C = 0.5 + 3.0**0.5 / 6.0
-
-
-class SDIRK3(_Candidate):
-    """Three stages, third order, L-stable (Alexander 1977)."""
-
-    name = "sdirk3"
-    order = 3
-    tableau = Tableau(
-        rows=((_G,), (0.5 * (1.0 - _G), _G), (-1.5 * _G**2 + 4.0 * _G - 0.25, 1.5 * _G**2 - 5.0 * _G + 1.25, _G))
-    )
 
 
 class Crouzeix(_Candidate):
