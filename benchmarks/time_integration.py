@@ -15,8 +15,7 @@ body's bounding box: against velocity Verlet with small steps; for ``slide``, si
 against SDIRK3 with small steps; for ``rest`` against the static equilibrium. Each line has the Newton and conjugate
 gradient iterations and the median wall time of the repeats, without compiling. Then, for an error between those of all,
 each scheme's wall time for it, read off between its lines (or that of its largest error, if all are less), over the
-least of all. ``spin`` also tells the change of the
-angular momentum and of the energy.
+least of all. ``spin`` also tells the change of the angular momentum and of the energy.
 
 Then the greatest and the last energy over the first, from extreme starts: points put at random, a body squashed to a
 tenth, one stretched to three times its size. Last, runs by an error target: what they achieve of it.

@@ -151,8 +151,8 @@ class Scene:
         bodies: at least one; all of the same dimension.
         solver: how time is stepped, for example ``BackwardEuler()``.
         dt: time step [s]; it is shortened to divide the frame interval. ``"auto"`` takes a safe part of the
-            stability limit for explicit solvers and the frame interval for implicit ones, which damps motion
-            that is not much slower.
+            stability limit for explicit solvers, what its error target allows for a solver that has one, and the frame
+            interval for other implicit ones, which is too long to follow motion that is not much slower.
         gravity: acceleration [m/s^2]; ``None`` for none.
         obstacles: planes, spheres and box walls.
         damping: mass-proportional damping alpha [1/s], >= 0: the force -alpha m v.
