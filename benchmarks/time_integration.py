@@ -22,6 +22,7 @@ tenth, one stretched to three times its size. Last, runs by an error target: wha
 """
 
 import argparse
+import contextlib
 import statistics
 import time
 import warnings
@@ -199,24 +200,27 @@ def _name(solver: ImplicitSolver) -> str:
 def front(name: str, problem: Problem, quick: bool) -> None:
     """Prints error and cost of all schemes for a motion, and the wall time of each for one error."""
     expected = reference(name, problem, quick)
+    cases = [(solver, steps) for steps in problem.steps[: 2 if quick else 4] for solver in [*SCHEMES, *CANDIDATES]]
+    runs: dict[tuple[ImplicitSolver, int], list[Run]] = {}
+    for _ in range(1 if quick else 3):  # by turns, so that what else the machine does falls on all of them
+        for solver, steps in cases:
+            with contextlib.suppress(wf.SimulationError, AssertionError):
+                runs.setdefault((solver, steps), []).append(run(problem.scene(solver), problem.duration, steps))
     print(f"\n{name}\n{'scheme':22} steps     error  Newton     CG  seconds")
     lines: dict[str, list[tuple[float, float]]] = {}
-    for solver in [*SCHEMES, *CANDIDATES]:
-        for steps in problem.steps[:2] if quick else problem.steps:
-            scene = problem.scene(solver)
-            try:
-                runs = [run(scene, problem.duration, steps) for _ in range(1 if quick else 3)]
-            except (wf.SimulationError, AssertionError) as failure:
-                print(f"{_name(solver):22} {steps:5d}  fails: {str(failure)[:70]}")
-                continue
-            one, seconds = runs[0], statistics.median(own.seconds for own in runs)
-            off = error(scene, one.displacement, expected)
-            lines.setdefault(_name(solver), []).append((off, seconds))
-            told = f"{_name(solver):22} {steps:5d} {off:9.2e} {one.newton:7d} {one.cg:6d} {seconds:8.3f}"
-            if name == "spin":
-                lost = one.angular_momentum[-1] / one.angular_momentum[0] - 1.0
-                told += f"  angular momentum {lost:+.1e}, energy {one.energies[-1] / one.energies[0] - 1.0:+.1e}"
-            print(told, flush=True)
+    for solver, steps in sorted(cases, key=lambda case: [*SCHEMES, *CANDIDATES].index(case[0])):
+        if (solver, steps) not in runs:
+            print(f"{_name(solver):22} {steps:5d}  fails")
+            continue
+        one = runs[solver, steps][0]
+        seconds = statistics.median(own.seconds for own in runs[solver, steps])
+        off = error(problem.scene(solver), one.displacement, expected)
+        lines.setdefault(_name(solver), []).append((off, seconds))
+        told = f"{_name(solver):22} {steps:5d} {off:9.2e} {one.newton:7d} {one.cg:6d} {seconds:8.3f}"
+        if name == "spin":
+            lost = one.angular_momentum[-1] / one.angular_momentum[0] - 1.0
+            told += f"  angular momentum {lost:+.1e}, energy {one.energies[-1] / one.energies[0] - 1.0:+.1e}"
+        print(told, flush=True)
     _compare(lines)
 
 

@@ -48,6 +48,7 @@ def swung(solver, duration, frames, **scene):
     for frame in range(1, frames + 1):
         while (left := frame * interval - state.time) > 1e-9 * interval:
             step = controlled_step(stepper, solver.order, state, left, wanted, interval)
+            assert step.report.error <= 1.0
             wanted = step.wanted
             steps.append(step.dt)
     assert state.time == pytest.approx(duration, rel=1e-12)
