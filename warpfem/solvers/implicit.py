@@ -184,6 +184,7 @@ class ImplicitStepper(Stepper):
             base_u, base_v = self._stage_base(state, dt, row)
             acceleration = self._rates[index - 1][1] if index else None
             stage = self._stage(state, base_u, base_v, acceleration, state.time + sum(row) * dt, h, dt)
+            self._require_solved(stage)
             report = stage if report is None else replace(report + stage, parts=1)
             if index < len(self._rates):
                 velocity, acceleration = self._rates[index]
@@ -252,10 +253,7 @@ class ImplicitStepper(Stepper):
             potential.add_scaled(u, -1.0, state.u, way)
         if potential.crosses_an_obstacle(state.u, way):
             report = replace(report, converged=False, rounded=False, note="a point goes round or through a sphere")
-        if not (report.converged or report.rounded or self.config.unconverged == "accept"):
-            raise SimulationError(
-                f"{report.note}, with a residual of {report.residual:.1e}; {worst_cell(model, self.newton.u)}"
-            )
+            self._require_solved(report)
         if self._norm is not None:
             report = replace(report, error=self._estimate_error(state, dt, h))
             if not report.error <= most_error:
@@ -283,6 +281,13 @@ class ImplicitStepper(Stepper):
         if self.model.supports is not None:
             self.model.supports.project(error)
         return self._norm(error) / (self.error * dt)
+
+    def _require_solved(self, report: StepReport) -> None:
+        """Raises SimulationError where a solution that failed is not to be kept."""
+        if not (report.converged or report.rounded or self.config.unconverged == "accept"):
+            raise SimulationError(
+                f"{report.note}, with a residual of {report.residual:.1e}; {worst_cell(self.model, self.newton.u)}"
+            )
 
     def _require_uninverted(self, u: wp.array) -> None:
         """Raises SimulationError where a material that does not bear inversion has it at ``u``."""
