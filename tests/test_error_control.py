@@ -5,6 +5,7 @@ import pytest
 from stepping import modes, ready, slab, solver_name
 
 import warpfem as wf
+from warpfem.cli import _summary_text
 from warpfem.explain import explain
 from warpfem.solvers.error_control import controlled_step
 from warpfem.solvers.stability import largest_frequency
@@ -105,6 +106,18 @@ def test_frames_are_at_their_times_and_the_summary_tells_the_steps():
     assert summary.longest_dt == pytest.approx(1.0 / 20.0)
     assert summary.rejected_steps > 0 and summary.steps > 20
     assert summary.unconverged_steps == 0
+
+
+def test_the_command_tells_the_range_of_steps():
+    simulation = wf.Simulation(falling_block(wf.SDIRK2(error=1e-2)))
+    list(simulation.frames())
+    summary = simulation.summary
+    length = f"{summary.shortest_dt:.4g} to {summary.longest_dt:.4g} s"
+    told = f"{summary.steps} steps of {length} ({summary.rejected_steps} more were tried and not taken)"
+    assert told in _summary_text(summary, simulation)
+    fixed = wf.Simulation(falling_block(wf.SDIRK2(), frames=2))
+    list(fixed.frames())
+    assert "3 frames, 2 steps of 0.05 s, 0.100 s simulated" in _summary_text(fixed.summary, fixed)
 
 
 def test_explain_tells_the_range_of_steps():
