@@ -53,7 +53,8 @@ _GAMMA_3 = 0.43586652150845899942
 class SDIRK2(SinglyDiagonallyImplicit):
     """Singly diagonally implicit Runge-Kutta of two stages, second order, L-stable (Alexander 1977).
 
-    It damps motion that dt does not resolve, as backward Euler does, and little of what it resolves.
+    It damps motion that dt does not resolve, as backward Euler does, and little of what it resolves: for motion that is
+    to be followed with contact, friction, or from any start.
     """
 
     name = "sdirk2"
@@ -63,7 +64,12 @@ class SDIRK2(SinglyDiagonallyImplicit):
 
 @dataclass(frozen=True)
 class SDIRK3(SinglyDiagonallyImplicit):
-    """Singly diagonally implicit Runge-Kutta of three stages, third order, L-stable (Alexander 1977)."""
+    """Singly diagonally implicit Runge-Kutta of three stages, third order, L-stable (Alexander 1977).
+
+    For impacts and small errors: of the block that falls on a floor in ``benchmarks/time_integration.py`` it has less
+    than half the error of SDIRK2 for as many linear solves. Long steps damp what they barely resolve more than those of
+    SDIRK2, which loses less of a spin.
+    """
 
     name = "sdirk3"
     order = 3
