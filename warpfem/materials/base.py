@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from warpfem.errors import MaterialError
+from warpfem.materials.volumetric import VolumetricMeasure
 from warpfem.moduli import ElasticModuli, Parameter, elastic_moduli
 
 
@@ -30,6 +31,8 @@ class Constitutive:
         barrier: whether psi is infinite for J <= 0, so that a step may not lead there.
         differentiable: whether Warp can differentiate ``stress``: not if it calls ``wp.grad``, through which
             gradients silently do not flow.
+        volumetric: the measure theta if the energy is psi(F; mu, 0) + lam/2 theta^2, which averaged cells need; else
+            ``None``.
     """
 
     energy_density: Any
@@ -41,6 +44,7 @@ class Constitutive:
     corotated: bool = False
     barrier: bool = False
     differentiable: bool = True
+    volumetric: VolumetricMeasure | None = None
 
 
 class Material(ABC):
@@ -126,3 +130,7 @@ class HookeanMaterial(Material):
 
     def parameters(self) -> tuple[Parameter, ...]:
         return self.moduli.mu, self.moduli.lam
+
+    def with_lam(self, lam: Parameter) -> "HookeanMaterial":
+        """The material of the same shear modulus with another ``lam`` [Pa]."""
+        return type(self)(mu=self.mu, lam=lam)

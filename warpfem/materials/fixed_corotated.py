@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from warpfem.materials.base import Constitutive, HookeanMaterial
+from warpfem.materials.volumetric import VOLUME_CHANGE
 from warpfem.tensor import (
     cofactor,
     cofactor_change,
@@ -65,4 +66,4 @@ class FixedCorotated(HookeanMaterial):
 
     name = "fixed_corotated"
     least_nu = 0.0
-    functions = Constitutive(energy_density, stress, stress_differential, corotated=True)
+    functions = Constitutive(energy_density, stress, stress_differential, corotated=True, volumetric=VOLUME_CHANGE)

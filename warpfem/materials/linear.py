@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from warpfem.materials.base import Constitutive, HookeanMaterial
+from warpfem.materials.volumetric import TRACE
 from warpfem.tensor import identity_like, symmetric_part
 
 
@@ -33,4 +34,6 @@ class LinearElasticity(HookeanMaterial):
     """
 
     name = "linear"
-    functions = Constitutive(energy_density, stress, stress_differential, isotropic=False, convex=True)
+    functions = Constitutive(
+        energy_density, stress, stress_differential, isotropic=False, convex=True, volumetric=TRACE
+    )

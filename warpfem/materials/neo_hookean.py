@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from warpfem.materials.base import Constitutive, HookeanMaterial
+from warpfem.materials.volumetric import LOG_VOLUME_RATIO
 from warpfem.tensor import (
     cofactor,
     deformation_gradient,
@@ -61,4 +62,4 @@ class NeoHookean(HookeanMaterial):
 
     name = "neo_hookean"
     least_nu = 0.0
-    functions = Constitutive(energy_density, stress, stress_differential, barrier=True)
+    functions = Constitutive(energy_density, stress, stress_differential, barrier=True, volumetric=LOG_VOLUME_RATIO)

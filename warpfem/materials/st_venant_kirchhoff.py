@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from warpfem.materials.base import Constitutive, HookeanMaterial
+from warpfem.materials.volumetric import GREEN_TRACE
 from warpfem.tensor import deformation_gradient, identity_like, symmetric_part
 
 
@@ -50,4 +51,4 @@ class StVenantKirchhoff(HookeanMaterial):
 
     name = "st_venant_kirchhoff"
     resists_mirroring = False
-    functions = Constitutive(energy_density, stress, stress_differential)
+    functions = Constitutive(energy_density, stress, stress_differential, volumetric=GREEN_TRACE)

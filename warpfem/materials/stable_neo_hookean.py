@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from warpfem.materials.base import Constitutive, HookeanMaterial
+from warpfem.materials.volumetric import VOLUME_CHANGE
 from warpfem.moduli import Parameter
 from warpfem.tensor import (
     cofactor,
@@ -64,7 +65,7 @@ class StableNeoHookean(HookeanMaterial):
 
     name = "stable_neo_hookean"
     least_nu = -0.85
-    functions = Constitutive(energy_density, stress, stress_differential)
+    functions = Constitutive(energy_density, stress, stress_differential, volumetric=VOLUME_CHANGE)
 
     def parameters(self) -> tuple[Parameter, ...]:
         mu, lam = self.moduli.mu, self.moduli.lam
