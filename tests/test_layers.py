@@ -12,10 +12,11 @@ LAYERS = [
     {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child", "recovery"},
     {"mesh", "points"},
     {"materials"},
-    {"elements", "meshing", "folds"},
+    {"elements", "meshing", "folds", "patches", "patch_kernels"},
     {"scene"},
     {"supports", "contact"},
     {"model"},
+    {"averaged"},
     {"linear", "reactions"},
     {"solvers"},
     {"simulation"},
@@ -29,7 +30,7 @@ LAYERS = [
 """From the bottom up; a module imports only from the layers below its own."""
 
 # Imported inside a function, where the lower module hands work to an optional upper one.
-UPWARD = {("model", "linear"), ("meshing", "usd")}
+UPWARD = {("model", "averaged"), ("model", "linear"), ("meshing", "usd")}
 
 
 def level(module: str) -> int:

@@ -511,7 +511,7 @@ def test_a_body_says_what_its_cells_are():
     assert wf.Body("block", block(2), material, element="quadratic").mesh.order == 2
     with pytest.raises(SceneError, match=r"'block': element='linear', but the mesh is quadratic"):
         wf.Body("block", block(2).quadratic(), material, element="linear")
-    with pytest.raises(SceneError, match=r"element must be 'linear' or 'quadratic'.*, not 'cubic'"):
+    with pytest.raises(SceneError, match=r"element must be 'linear', 'quadratic' or 'averaged', not 'cubic'"):
         wf.Body("block", block(2), material, element="cubic")
 
 

@@ -228,6 +228,7 @@ class TangentOperator(ABC):
         self.hessian: Hessian = "exact"
         self.supports = model.supports if external else None
         self.contact = model.contact if external else None
+        self.averaged = [block for block in model.blocks if block.averaged]
         self.inverse_diagonal: wp.array | None = None
         self.diagonal: wp.array
         self.contact_blocks = self._new_blocks(model.point_count) if self.contact is not None else None
@@ -273,7 +274,10 @@ class TangentOperator(ABC):
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.model.point_count, inputs=inputs, outputs=outputs, device=self.model.device)
 
-    def _update_contact(self, u: wp.array, friction: tuple[wp.array, float] | None) -> None:
+    def _linearize_couplings(self, u: wp.array, friction: tuple[wp.array, float] | None) -> None:
+        """Those of averaged cells, and contact."""
+        for block in self.averaged:
+            block.linearize(u)
         if self.contact is None:
             return
         self.contact_blocks.zero_()
@@ -286,6 +290,8 @@ class TangentOperator(ABC):
         blocks.zero_()
         for block, own in zip(self.model.blocks, slots, strict=True):
             block.launch(self._kernel("stiffness"), [u, own], [blocks])
+        for block in self.averaged:
+            block.add_coupling_diagonal(self.diagonal, blocks)
         if mass_weight > 0.0:
             self._launch(self.kernels.add_mass, [self.model.mass, mass_weight, self.diagonal], [blocks])
         if self.contact_blocks is not None:
@@ -312,7 +318,7 @@ class AssembledOperator(TangentOperator):
 
     def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
         self.hessian = hessian
-        self._update_contact(u, friction)
+        self._linearize_couplings(u, friction)
         self._assemble(u, self.slots, mass_weight, self.blocks)
         if self.supports is not None:
             wp.launch(
@@ -327,6 +333,10 @@ class AssembledOperator(TangentOperator):
 
     def apply(self, p, product_out) -> None:
         self._launch(self.kernels.multiply, [self.row_starts, self.columns, self.blocks, p], [product_out])
+        for block in self.averaged:
+            block.add_coupling(p, product_out, diagonal=False)  # its diagonal is in the blocks
+        if self.averaged and self.supports is not None:
+            self.supports.project(product_out)
 
     def arrays(self) -> list[wp.array]:
         optional = [self.contact_blocks, self.inverse_diagonal]
@@ -368,7 +378,7 @@ class _UnassembledOperator(TangentOperator):
         self.u = u
         self.hessian = hessian
         self.mass_weight = mass_weight
-        self._update_contact(u, friction)
+        self._linearize_couplings(u, friction)
         if precondition:
             blocks, slots, rows = self._diagonal_blocks
             self._assemble(u, slots, mass_weight, blocks)
@@ -408,6 +418,8 @@ class ClosedFormOperator(_UnassembledOperator):
         name = self._kernel("differential")
         for block in self.model.blocks:
             block.launch(name, [self.u, p], [product_out])
+        for block in self.averaged:
+            block.add_coupling(p, product_out, diagonal=True)
 
 
 class TapeOperator(_UnassembledOperator):
@@ -422,6 +434,8 @@ class TapeOperator(_UnassembledOperator):
         self._u = wp.zeros(model.point_count, dtype=types_.vector, device=device, requires_grad=True)
         self._force = wp.zeros(model.point_count, dtype=types_.vector, device=device, requires_grad=True)
         self._tape: wp.Tape | None = None
+        for block in self.averaged:
+            block.require_gradients()
 
     def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
         if hessian != "exact":
@@ -443,6 +457,8 @@ class TapeOperator(_UnassembledOperator):
         self._launch(self.kernels.subtract, [product], [self._u.grad])
 
     def _add_stiffness_product(self, p, product_out) -> None:
+        for block in self.averaged:
+            block.update_pressure(self._u)
         self._tape.backward(grads={self._force: p})
         self._launch(self.kernels.subtract, [self._u.grad], [product_out])
         self._tape.zero()

@@ -16,9 +16,10 @@ from warpfem.boundary import PointForce, Traction
 from warpfem.dtypes import FloatName, types, uniform_array
 from warpfem.elements import ElementKernels, element_kernels
 from warpfem.errors import SceneError, SimulationError
-from warpfem.materials import HookeanMaterial
+from warpfem.materials import Constitutive, HookeanMaterial
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
+from warpfem.shapes import Shape
 
 if TYPE_CHECKING:
     from warpfem.contact import Contact
@@ -153,18 +154,22 @@ class CellBlock:
         count: cells.
         arguments: device arrays ``cells, inverse_shape, volume, parameters`` by name; the second and the third have
             an entry for each quadrature point, cell by cell.
+        averaged: whether the cells are coupled beyond their points: then it is an ``AveragedBlock``.
+        bounding_kernels: kernels by which the stiffness of the whole is at most the sum over the cells.
     """
+
+    averaged = False
 
     def __init__(self, kernels: ElementKernels, parts: list[tuple[Body, int, int]], device) -> None:
         t = kernels.types
         meshes = [body.mesh for body, _, _ in parts]
-        self.kernels = kernels
+        self.kernels = self.bounding_kernels = kernels
         self.shape = kernels.shape
         self.device = device
         self.count = sum(mesh.cell_count for mesh in meshes)
         self.index = np.concatenate([start + np.arange(b.mesh.cell_count) for b, _, start in parts])
         self.host_cells = np.concatenate([start + body.mesh.cells for body, start, _ in parts])
-        rows = [body.material.parameter_rows(body.mesh.cell_count) for body, _, _ in parts]
+        rows = [self._parameter_rows(body) for body, _, _ in parts]
         if len(rows) == 1 and len(rows[0]) == 1:
             parameters = uniform_array(rows[0], self.count, kernels.parameter_vector, device)
         else:
@@ -183,12 +188,27 @@ class CellBlock:
             "parameters": parameters,
         }
 
-    def launch(self, name: str, inputs: list, outputs: list, *, part: slice | None = None) -> None:
+    def _parameter_rows(self, body: Body) -> np.ndarray:
+        return body.material.parameter_rows(body.mesh.cell_count)
+
+    def arrays(self) -> list[wp.array]:
+        """The device arrays held."""
+        return list(self.arguments.values())
+
+    def launch(
+        self,
+        name: str,
+        inputs: list,
+        outputs: list,
+        *,
+        part: slice | None = None,
+        kernels: ElementKernels | None = None,
+    ) -> None:
         """Launches the kernel of that name over the quadrature points of the cells, or of a part of them.
 
         Of :attr:`arguments` it gets first those that it names. The kernel ``frequency`` runs over cells.
         """
-        kernel = getattr(self.kernels, name)
+        kernel = getattr(kernels or self.kernels, name)
         arrays = self.arguments if part is None else self._arguments_of(part)
         own = [arrays[argument.label] for argument in kernel.adj.args if argument.label in arrays]
         tasks = len(arrays["cells"]) if name == "frequency" else len(arrays["volume"])
@@ -266,11 +286,20 @@ class Model:
         return wp.array(data, dtype=dtype, device=self.device)
 
     def _cell_blocks(self) -> list[CellBlock]:
-        parts: dict[ElementKernels, list[tuple[Body, int, int]]] = {}
+        parts: dict[tuple, list[tuple[Body, int, int]]] = {}
         for body, point_start, cell_start in zip(self.scene.bodies, self.point_starts, self.cell_starts, strict=False):
-            kernels = element_kernels(body.material.constitutive, body.mesh.shape, self.dtype)
-            parts.setdefault(kernels, []).append((body, int(point_start), int(cell_start)))
-        return [CellBlock(kernels, bodies, self.device) for kernels, bodies in parts.items()]
+            key = body.material.constitutive, body.mesh.shape, body.element == "averaged"
+            parts.setdefault(key, []).append((body, int(point_start), int(cell_start)))
+        return [self._cell_block(*key, bodies) for key, bodies in parts.items()]
+
+    def _cell_block(
+        self, constitutive: Constitutive, shape: Shape, averaged: bool, bodies: list[tuple[Body, int, int]]
+    ) -> CellBlock:
+        if averaged:
+            from warpfem.averaged import AveragedBlock
+
+            return AveragedBlock(constitutive, bodies, self.dtype, self.device)
+        return CellBlock(element_kernels(constitutive, shape, self.dtype), bodies, self.device)
 
     def _supports(self) -> Supports | None:
         if not any(body.supports for body in self.scene.bodies):
@@ -324,7 +353,7 @@ class Model:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        own = [self.mass, self.inverse_mass, *(array for block in self.blocks for array in block.arguments.values())]
+        own = [self.mass, self.inverse_mass, *(array for block in self.blocks for array in block.arrays())]
         if self.dead_load is not None:
             own.append(self.dead_load)
         for term in (self.supports, self.contact):
@@ -464,7 +493,8 @@ class Model:
 
         Returns:
             For each block of :attr:`blocks` a float64 array (count, k, d, k, d) [N/m] for cells of k points,
-            indexed by point and component of the force, then of the displacement.
+            indexed by point and component of the force, then of the displacement. That of an averaged cell is what
+            it would have if its volume change were its own: the whole has less than the sum.
         """
         parts: dict[CellBlock, list[np.ndarray]] = {block: [] for block in self.blocks}
         for block, _, stiffness in self.element_stiffness_parts(u):
@@ -489,7 +519,7 @@ class Model:
                 slots = np.arange(count * corners**2, dtype=np.int32).reshape(count, corners, corners)
                 values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
                 slot_array = wp.array(slots, dtype=wp.int32, device=self.device)
-                block.launch("stiffness", [u, slot_array], [values], part=part)
+                block.launch("stiffness", [u, slot_array], [values], part=part, kernels=block.bounding_kernels)
                 entries = values.numpy().astype(np.float64).reshape(count, corners, corners, d, d)
                 yield block, part, entries.transpose(0, 1, 3, 2, 4)
 

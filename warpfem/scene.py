@@ -10,7 +10,7 @@ import numpy as np
 
 from warpfem.boundary import Load, Obstacle, Support, Vector, is_number
 from warpfem.errors import SceneError, source_of, user_code
-from warpfem.materials import Material
+from warpfem.materials import HookeanMaterial, Material
 from warpfem.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
 """One vector for all points, an array (point_count, dim), or a function of the rest points."""
 
 
-ELEMENTS = ("linear", "quadratic")
+ELEMENTS = ("linear", "quadratic", "averaged")
 """What a body's cells can be."""
 
 _MOST = 1e12
@@ -44,9 +44,11 @@ class Body:
             1 m thick.
         supports: pins and prescribed motions.
         loads: point forces and tractions.
-        element: "linear" or "quadratic"; ``None`` takes the mesh as it is. "quadratic" gives a linear mesh midpoints
-            (:meth:`Mesh.quadratic`), and :attr:`mesh` is then the quadratic one, to which arrays per point refer:
-            several times the cost, for an accuracy that linear cells reach at a hundred times the cost or never.
+        element: "linear", "quadratic" or "averaged"; ``None`` takes the mesh as it is. "quadratic" gives a linear mesh
+            midpoints (:meth:`Mesh.quadratic`), and :attr:`mesh` is then the quadratic one, to which arrays per point
+            refer: several times the cost, for an accuracy that linear cells reach at a hundred times the cost or
+            never. "averaged" cells are linear and share their volumetric strain with their neighbours: as accurate
+            for nu near 0.5 as linear ones are for less.
         displacement: initial displacement [m]: one vector for all points, an array (point_count, dim), or a
             function of the rest points (point_count, dim) that returns either; ``None`` starts at rest shape.
         velocity: initial velocity [m/s], likewise; ``None`` starts at rest.
@@ -58,7 +60,7 @@ class Body:
     density: float | np.ndarray = 1000.0
     supports: Sequence[Support] = ()
     loads: Sequence[Load] = ()
-    element: Literal["linear", "quadratic"] | None = None
+    element: Literal["linear", "quadratic", "averaged"] | None = None
     displacement: PointField | None = None
     velocity: PointField | None = None
 
@@ -100,7 +102,7 @@ class Body:
         if self.element is None:
             object.__setattr__(self, "element", ELEMENTS[order - 1])
         elif not isinstance(self.element, str) or self.element not in ELEMENTS:
-            known = " or ".join(map(repr, ELEMENTS))
+            known = ", ".join(map(repr, ELEMENTS[:-1])) + f" or {ELEMENTS[-1]!r}"
             raise SceneError(f"body '{self.name}': element must be {known}, not {self.element!r}")
         elif self.element == "quadratic":
             object.__setattr__(self, "mesh", self.mesh.quadratic())
@@ -108,6 +110,26 @@ class Body:
             raise SceneError(
                 f"body '{self.name}': element='{self.element}', but the mesh is quadratic: leave it out, or give the "
                 "linear mesh"
+            )
+        if self.element == "averaged":
+            self._require_averageable()
+
+    def _require_averageable(self) -> None:
+        """Raises SceneError unless the material has a volumetric part with nu > 0 for cells to average."""
+        material = self.material
+        if not isinstance(material, HookeanMaterial) or material.constitutive.volumetric is None:
+            raise SceneError(
+                f"body '{self.name}': element='averaged' averages the volumetric part of the energy, which "
+                f"{type(material).__name__} does not state: take element='quadratic'"
+            )
+        values = np.atleast_1d(np.asarray(material.nu, dtype=np.float64))
+        bad = ~(values > 0.0)
+        if bad.any():
+            nu = values[np.argmax(bad)]
+            where = f" of cell {int(np.argmax(bad))} ({int(bad.sum())} in all)" if len(bad) > 1 else ""
+            raise SceneError(
+                f"body '{self.name}': element='averaged' is for nu > 0, and the nu{where} is {nu:g}: take "
+                "element='linear', which does not lock there"
             )
 
     def initial_displacement(self) -> np.ndarray:

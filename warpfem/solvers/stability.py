@@ -88,7 +88,7 @@ class Watch:
         """The estimate of the largest stable time step [s] at the displacements ``u``."""
         self._square.zero_()
         for block, density in zip(self.model.blocks, self._densities, strict=True):
-            block.launch("frequency", [density, u], [self._square])
+            block.launch("frequency", [density, u], [self._square], kernels=block.bounding_kernels)
         square = float(self._square.numpy()[0]) + self._contact
         return 2.0 / float(np.sqrt(square)) if square > 0.0 else np.inf
 
