@@ -18,8 +18,8 @@ Chosen by measurement (``benchmarks/locking.py``, at nu = 0.4999):
 
 - Means over the cells about each point, the other common choice, cure irregular meshes, but hardly those of
   ``Mesh.rectangle`` and of five tetrahedra a cube. Their pressures alternate from cell to cell: in a squashed block the
-  mean over neighbours takes away 17 to 77 % of them, of those of patches 4 to 37 %, most on the coarsest meshes. Keeping
-  5 % of lam in each cell (Puso and Solberg 2006) makes both a little worse.
+  mean over neighbours takes away 17 to 77 % of them, of those of patches 4 to 37 %, most on the coarsest meshes.
+  Keeping 5 % of lam in each cell (Puso and Solberg 2006) makes both a little worse.
 - Patches bend about as plain cells do at nu = 0.3. Quadratic cells bend better with as many unknowns, but in irregular
   meshes of tetrahedra with pressures of which 79 to 93 % alternate.
 - None has soft modes: the lowest eigenvalues of a free block are those of the solid.
