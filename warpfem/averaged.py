@@ -61,16 +61,22 @@ class AveragedBlock(CellBlock):
             patches.append(self.patch_count + cell_patches(body.mesh, _moduli(body)[1]))
             self.patch_count = int(patches[-1].max()) + 1
         self.patch = np.concatenate(patches)
+        self._point_bound = int(self.host_cells.max()) + 1
         self._arrays = self._patch_arrays(
             np.concatenate([_moduli(body)[1] * body.mesh.cell_volumes for body, *_ in parts])
         )
 
     def _patch_arrays(self, weights: np.ndarray) -> dict[str, wp.array]:
-        """The arrays over patches, in compressed rows of their cells (``starts, members``) and points (``row_starts``,
-        ``points``), with the place of each cell's points in the rows; from lam_a V of the cells."""
-        t, patch = self.kernels.types, self.patch
-        bound = int(self.host_cells.max()) + 1
+        """The arrays over patches, from lam_a V of the cells.
+
+        The cells of each are ``starts, members``, the entries of its row r_g ``row_starts, points``, with the place in
+        them of each cell's points in ``places``; the entries by columns ``column_starts, column_entries,
+        column_patches``.
+        """
+        t, patch, bound = self.kernels.types, self.patch, self._point_bound
         keys, places = np.unique(patch[:, None].astype(np.int64) * bound + self.host_cells, return_inverse=True)
+        patches, points = np.divmod(keys, bound)
+        by_point = np.argsort(points, kind="stable")
 
         def integers(data: np.ndarray) -> wp.array:
             return wp.array(data, dtype=wp.int32, device=self.device)
@@ -80,10 +86,14 @@ class AveragedBlock(CellBlock):
             "starts": integers(np.concatenate([[0], np.cumsum(np.bincount(patch))])),
             "members": integers(np.argsort(patch, kind="stable")),
             "row_starts": integers(np.searchsorted(keys, np.arange(self.patch_count + 1) * bound)),
-            "points": integers(keys % bound),
+            "points": integers(points),
             "places": integers(places.reshape(self.host_cells.shape)),
+            "column_starts": integers(np.searchsorted(points[by_point], np.arange(bound + 1))),
+            "column_entries": integers(by_point),
+            "column_patches": integers(patches[by_point]),
             "inverse_modulus": wp.array(1.0 / np.bincount(patch, weights), dtype=t.scalar, device=self.device),
             "strain": wp.zeros(self.patch_count, dtype=t.scalar, device=self.device),
+            "rate": wp.zeros(self.patch_count, dtype=t.scalar, device=self.device),
         }
 
     def _parameter_rows(self, body: Body) -> np.ndarray:
@@ -127,7 +137,8 @@ class AveragedBlock(CellBlock):
 
     def add_coupling(self, p: wp.array, product_out: wp.array, *, diagonal: bool) -> None:
         """Adds the product of the coupling with p, with or without its blocks on the diagonal."""
-        self._launch_own("product", self.patch_count, [1.0 if diagonal else 0.0, p], [product_out])
+        self._launch_own("rate", self.patch_count, [p], [self._arrays["rate"]])
+        self._launch_own("product", self._point_bound, [1.0 if diagonal else 0.0, p], [product_out])
 
     def add_coupling_diagonal(self, diagonal: wp.array, blocks_out: wp.array) -> None:
         """Adds the coupling's blocks on the diagonal, which are at the places ``diagonal``."""

@@ -169,25 +169,41 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
             rows_out[places[c, 0]] -= total
 
     @wp.kernel(module="unique", enable_backward=False)
-    def coupling_product(
+    def coupling_rate(
         inverse_modulus: wp.array(dtype=scalar),
         row_starts: wp.array(dtype=wp.int32),
         points: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=vector),
+        p: wp.array(dtype=vector),
+        rate_out: wp.array(dtype=scalar),
+    ):
+        """Writes r_g^T p / L_g."""
+        g = wp.tid()
+        total = scalar(0.0)
+        for entry in range(row_starts[g], row_starts[g + 1]):
+            total += wp.dot(rows[entry], p[points[entry]])
+        rate_out[g] = inverse_modulus[g] * total
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def coupling_product(
+        inverse_modulus: wp.array(dtype=scalar),
+        column_starts: wp.array(dtype=wp.int32),
+        column_entries: wp.array(dtype=wp.int32),
+        column_patches: wp.array(dtype=wp.int32),
+        rows: wp.array(dtype=vector),
+        rate: wp.array(dtype=scalar),
         own: scalar,
         p: wp.array(dtype=vector),
         product_out: wp.array(dtype=vector),
     ):
         """Adds r_g r_g^T p / L_g, less the blocks on the diagonal where ``own`` is 0."""
-        g = wp.tid()
-        total = scalar(0.0)
-        for entry in range(row_starts[g], row_starts[g + 1]):
-            total += wp.dot(rows[entry], p[points[entry]])
-        for entry in range(row_starts[g], row_starts[g + 1]):
-            row = rows[entry]
-            point = points[entry]
-            rate = total - (scalar(1.0) - own) * wp.dot(row, p[point])
-            wp.atomic_add(product_out, point, (inverse_modulus[g] * rate) * row)
+        i = wp.tid()
+        total = vector()
+        for k in range(column_starts[i], column_starts[i + 1]):
+            row = rows[column_entries[k]]
+            g = column_patches[k]
+            total += (rate[g] - (scalar(1.0) - own) * inverse_modulus[g] * wp.dot(row, p[i])) * row
+        product_out[i] += total
 
     @wp.kernel(module="unique", enable_backward=False)
     def coupling_diagonal(
@@ -202,7 +218,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
         g = wp.tid()
         for entry in range(row_starts[g], row_starts[g + 1]):
             row = rows[entry]
-            wp.atomic_add(blocks_out, diagonal[points[entry]], inverse_modulus[g] * wp.outer(row, row))
+            wp.atomic_add(blocks_out, diagonal[points[entry]], wp.outer(inverse_modulus[g] * row, row))
 
     return SimpleNamespace(
         strain=strain_kernel(False),
@@ -212,6 +228,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
         energy=patch_energy,
         density=cell_density,
         rows=coupling_rows,
+        rate=coupling_rate,
         product=coupling_product,
         diagonal=coupling_diagonal,
     )

@@ -23,6 +23,9 @@ PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
 ELEMENTS = ("linear", "quadratic", "averaged")
 """What a body's cells can be."""
 
+LEAST_AVERAGED_NU = 0.01
+"""Below this there is nothing to average, and in the end nothing to divide by."""
+
 _MOST = 1e12
 """The largest number of frames per second, time step [s] or damping [1/s]: what is beyond overflows in float32."""
 
@@ -47,8 +50,8 @@ class Body:
         element: "linear", "quadratic" or "averaged"; ``None`` takes the mesh as it is. "quadratic" gives a linear mesh
             midpoints (:meth:`Mesh.quadratic`), and :attr:`mesh` is then the quadratic one, to which arrays per point
             refer: several times the cost, for an accuracy that linear cells reach at a hundred times the cost or
-            never. "averaged" cells are linear and share their volumetric strain with their neighbours: as accurate
-            for nu near 0.5 as linear ones are for less.
+            never. "averaged" cells are linear and share their volume change with some neighbours: about as accurate
+            for nu near 0.5 as linear ones are for nu = 0.3.
         displacement: initial displacement [m]: one vector for all points, an array (point_count, dim), or a
             function of the rest points (point_count, dim) that returns either; ``None`` starts at rest shape.
         velocity: initial velocity [m/s], likewise; ``None`` starts at rest.
@@ -115,7 +118,7 @@ class Body:
             self._require_averageable()
 
     def _require_averageable(self) -> None:
-        """Raises SceneError unless the material has a volumetric part with nu > 0 for cells to average."""
+        """Raises SceneError unless the material has a volumetric part for cells to average."""
         material = self.material
         if not isinstance(material, HookeanMaterial) or material.constitutive.volumetric is None:
             raise SceneError(
@@ -123,13 +126,13 @@ class Body:
                 f"{type(material).__name__} does not state: take element='quadratic'"
             )
         values = np.atleast_1d(np.asarray(material.nu, dtype=np.float64))
-        bad = ~(values > 0.0)
+        bad = values < LEAST_AVERAGED_NU
         if bad.any():
             nu = values[np.argmax(bad)]
             where = f" of cell {int(np.argmax(bad))} ({int(bad.sum())} in all)" if len(bad) > 1 else ""
             raise SceneError(
-                f"body '{self.name}': element='averaged' is for nu > 0, and the nu{where} is {nu:g}: take "
-                "element='linear', which does not lock there"
+                f"body '{self.name}': element='averaged' is for nu >= {LEAST_AVERAGED_NU:g}, and the nu{where} is "
+                f"{nu:g}: take element='linear', which does not lock there"
             )
 
     def initial_displacement(self) -> np.ndarray:
