@@ -317,7 +317,7 @@ def squash(dim: int, n: int, amount: float, nu: float, element: str) -> str:
 
 def built_table() -> None:
     print("\ncantilever in warpfem, six jittered cells a cube, float64: unknowns, error in %, seconds, CG iterations")
-    for nu in (0.3, 0.49, 0.499, 0.4999):
+    for nu in (0.3, 0.49, 0.499):
         _, _, expected = cantilever(REFERENCE, 4, nu, "six a cube")
         for element, sizes in (("linear", (4, 6)), ("averaged", (4, 6)), ("quadratic", (2, 3))):
             row = []

@@ -21,10 +21,10 @@ Chosen by measurement (``benchmarks/locking.py``, at nu = 0.4999):
   mean over neighbours takes away 17 to 77 % of them, of those of patches 4 to 37 %, most on the coarsest meshes.
   Keeping 5 % of lam in each cell (Puso and Solberg 2006) makes both a little worse.
 - Patches bend about as plain cells do at nu = 0.3. Quadratic cells bend better with as many unknowns, but in irregular
-  meshes of tetrahedra with pressures of which 79 to 93 % alternate.
+  meshes of tetrahedra with pressures of which 75 to 93 % alternate.
 - None has soft modes: the lowest eigenvalues of a free block are those of the solid.
-- What a cell keeps of lam costs up to a third of the error more at small strains. Without it single cells collapse
-  under strong compression while their patch keeps its volume: squashed by half, to J = -0.19, with it to 0.10.
+- What a cell keeps of lam adds a fifth to a half to the error at small strains. Without it single cells collapse under
+  strong compression while their patch keeps its volume: squashed by half, to J = -0.19, with it to 0.10.
 """
 
 from typing import Any
