@@ -1,5 +1,10 @@
 """Implicit schemes that ``time_integration.py`` measures beside those of warpfem, and that were not kept.
 
+The trapezoidal rule, generalised-alpha and TR-BDF2 fail or gain energy from extreme starts; the first two are no more
+accurate than the midpoint rule, which also keeps angular momentum. BDF2 needs the step before, and has more than the
+error of SDIRK2 for the same iterations but on a rough floor. Crouzeix's scheme leaves fast motion undamped: it is slow
+to come to rest.
+
 They use warpfem's own solution of a step; damping and friction at the start of a step are left out.
 """
 

@@ -13,9 +13,10 @@ The motions, all in 2D and float64:
 The error is the root of the mean square of the displacements' error over the mass, relative to the diagonal of the
 body's bounding box: against velocity Verlet with small steps; for ``slide``, since explicit friction is another law,
 against SDIRK3 with small steps; for ``rest`` against the static equilibrium. Each line has the Newton and conjugate
-gradient iterations and the median wall time of the repeats, without compiling. Then, for an error between those of all,
-each scheme's wall time for it, read off between its lines (or that of its largest error, if all are less), over the
-least of all. ``spin`` also tells the change of the angular momentum and of the energy.
+gradient iterations and the median processor time of the repeats, without compiling; on a busy machine trust the
+iterations. Then, for an error between those of all, each scheme's cost, read off between its lines (or that of its
+largest error, if all are less), over the least of all. ``spin`` also tells the change of the angular momentum and of
+the energy.
 
 Then the greatest and the last energy over the first, from extreme starts: points put at random, a body squashed to a
 tenth, one stretched to three times its size. Last, runs by an error target: what they achieve of it.
@@ -136,9 +137,9 @@ def run(scene: wf.Scene, duration: float, steps: int) -> Run:
     newton = cg = 0
     energies, angular, seconds = [model.energies(state).total], [_angular_momentum(model, state)], 0.0
     for _ in range(steps):
-        start = time.perf_counter()
+        start = time.process_time()
         report = stepper.step(state, duration / steps)
-        seconds += time.perf_counter() - start
+        seconds += time.process_time() - start
         newton, cg = newton + report.newton_iterations, cg + report.cg_iterations
         energies.append(model.energies(state).total)
         angular.append(_angular_momentum(model, state))
@@ -152,13 +153,13 @@ def controlled_run(scene: wf.Scene, duration: float, frames: int) -> Run:
     stepper.prepare(state, duration / frames)
     interval = wanted = duration / frames
     steps = newton = cg = 0
-    start = time.perf_counter()
+    start = time.process_time()
     for frame in range(1, frames + 1):
         while (left := frame * interval - state.time) > 1e-9 * interval:
             step = controlled_step(stepper, scene.solver.order, state, left, wanted, interval)
             wanted, steps = step.wanted, steps + 1
             newton, cg = newton + step.report.newton_iterations, cg + step.report.cg_iterations
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     return Run(state.displacement, steps, newton, cg, seconds, np.empty(0), np.empty(0))
 
 
@@ -198,7 +199,7 @@ def _name(solver: ImplicitSolver) -> str:
 
 
 def front(name: str, problem: Problem, quick: bool) -> None:
-    """Prints error and cost of all schemes for a motion, and the wall time of each for one error."""
+    """Prints error and cost of all schemes for a motion, and the time of each for one error."""
     expected = reference(name, problem, quick)
     cases = [(solver, steps) for steps in problem.steps[: 2 if quick else 4] for solver in [*SCHEMES, *CANDIDATES]]
     runs: dict[tuple[ImplicitSolver, int], list[Run]] = {}
@@ -207,7 +208,7 @@ def front(name: str, problem: Problem, quick: bool) -> None:
             with contextlib.suppress(wf.SimulationError, AssertionError):
                 runs.setdefault((solver, steps), []).append(run(problem.scene(solver), problem.duration, steps))
     print(f"\n{name}\n{'scheme':22} steps     error  Newton     CG  seconds")
-    lines: dict[str, list[tuple[float, float]]] = {}
+    lines: dict[str, list[tuple[float, float, float]]] = {}
     for solver, steps in sorted(cases, key=lambda case: [*SCHEMES, *CANDIDATES].index(case[0])):
         if (solver, steps) not in runs:
             print(f"{_name(solver):22} {steps:5d}  fails")
@@ -215,7 +216,7 @@ def front(name: str, problem: Problem, quick: bool) -> None:
         one = runs[solver, steps][0]
         seconds = statistics.median(own.seconds for own in runs[solver, steps])
         off = error(problem.scene(solver), one.displacement, expected)
-        lines.setdefault(_name(solver), []).append((off, seconds))
+        lines.setdefault(_name(solver), []).append((off, one.newton, seconds))
         told = f"{_name(solver):22} {steps:5d} {off:9.2e} {one.newton:7d} {one.cg:6d} {seconds:8.3f}"
         if name == "spin":
             lost = one.angular_momentum[-1] / one.angular_momentum[0] - 1.0
@@ -224,19 +225,20 @@ def front(name: str, problem: Problem, quick: bool) -> None:
     _compare(lines)
 
 
-def _compare(lines: dict[str, list[tuple[float, float]]]) -> None:
-    """Prints the wall times for the error in the middle of all."""
-    target = float(np.exp(np.median([np.log(off) for own in lines.values() for off, _ in own])))
-    times, short = {}, []
+def _compare(lines: dict[str, list[tuple[float, float, float]]]) -> None:
+    """Prints Newton iterations and time for the error in the middle of all."""
+    target = float(np.exp(np.median([np.log(line[0]) for own in lines.values() for line in own])))
+    costs, short = {}, []
     for name, own in lines.items():
-        off, seconds = np.log(np.array(sorted(own))).T
+        off, *cost = np.log(np.array(sorted(own))).T
         if off[0] > np.log(target):
             short.append(name)
-        else:  # with larger errors than any of its own, a scheme would take at most its least time
-            times[name] = float(np.exp(np.interp(np.log(target), off, seconds)))
-    print(f"wall time for an error of {target:.1e}, over the least (not reached: {', '.join(short) or 'none'}):")
-    for name, seconds in sorted(times.items(), key=lambda item: item[1]):
-        print(f"  {name:22} {seconds / min(times.values()):5.2f}")
+        else:  # with larger errors than any of its own, a scheme would take at most its least cost
+            costs[name] = [float(np.exp(np.interp(np.log(target), off, one))) for one in cost]
+    least = np.min(list(costs.values()), axis=0)
+    print(f"for an error of {target:.1e} (not reached: {', '.join(short) or 'none'}), over the least: Newton, seconds")
+    for name, cost in sorted(costs.items(), key=lambda item: item[1]):
+        print(f"  {name:22} {cost[0] / least[0]:5.2f} {cost[1] / least[1]:5.2f}")
 
 
 STARTS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
