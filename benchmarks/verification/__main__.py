@@ -13,6 +13,7 @@ if not __package__:  # run as a folder
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
 import warp as wp
+
 from verification import report
 from verification.cases import CASES
 from verification.core import run_case

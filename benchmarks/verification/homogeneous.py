@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+
+import warpfem as wf
 from verification.core import Case, Check, Table, at_most
 from verification.models import model_of, solved
 from verification.principal import CLOSED_FORMS, MODES, free_stretch, stretches
-
-import warpfem as wf
 from warpfem.materials import HookeanMaterial
 
 STRETCHES = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.5, 2.0, 3.0, 5.0, 10.0)

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
+
+import warpfem as wf
 from verification.core import Case, Check, Table, between, orders
 from verification.hyperelastic import STRESSES, Stress
 from verification.models import ELEMENTS, ORDERS, body, model_of, point_forces, solved
 from verification.simplex import Field, boundary_loads, boundary_quadrature
-
-import warpfem as wf
 from warpfem.materials import HookeanMaterial
 
 MATERIALS = {"linear": wf.LinearElasticity, "neo_hookean": wf.NeoHookean}

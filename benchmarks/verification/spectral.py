@@ -113,6 +113,7 @@ class Grid:
         d = self.dim
         force = np.zeros((len(self.points), d))
         rows, columns, values = [], [], []
+        stress = np.errstate(invalid="ignore")(stress)
         for element, G, w in zip(self.elements, self.gradients, self.weights, strict=True):
             F = np.eye(d) + np.einsum("qaj,ai->qij", G, u[element])
             P = stress(F, mu, lam)
@@ -143,17 +144,22 @@ class Grid:
         """
         free = np.flatnonzero(~held.ravel())
         u = np.zeros((len(self.points), self.dim))
+        force, K = self.force_and_stiffness(u, stress, mu, lam)
         for step in range(1, steps + 1):
             target = load * (step / steps)
             for _ in range(30):
-                force, K = self.force_and_stiffness(u, stress, mu, lam)
                 residual = (target - force).ravel()[free]
                 if np.abs(residual).max() <= 1e-11 * np.abs(target).max():
                     break
-                change = np.zeros(self.size)
                 factors = splu(K[free][:, free], permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+                change = np.zeros(self.size)
                 change[free] = factors.solve(residual)
-                u += change.reshape(u.shape)
+                change = change.reshape(u.shape)
+                force, K = self.force_and_stiffness(u + change, stress, mu, lam)
+                while not np.isfinite(force).all():  # J <= 0 somewhere
+                    change *= 0.5
+                    force, K = self.force_and_stiffness(u + change, stress, mu, lam)
+                u += change
                 if np.abs(change).max() <= 1e-9 * np.abs(u).max():
                     break
             else:
