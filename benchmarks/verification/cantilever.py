@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 from scipy.integrate import solve_bvp
 
 import warpfem as wf
-from verification.core import Case, Check, Table, at_most, between, holds, orders
+from verification.core import Case, Check, Table, at_most, between, orders
 from verification.hyperelastic import lame, linear, neo_hookean
 from verification.models import ELEMENTS, body, model_of, solved
 from verification.spectral import box, graded
@@ -17,8 +18,9 @@ NU = 0.3
 
 # 3D: a beam of 4 x 1 x 1 under its weight, E = 2e7, density 1000, g = 9.81, linear
 SIZE, E, DENSITY, GRAVITY = (4.0, 1.0, 1.0), 2e7, 1000.0, 9.81
-SAG = -0.19642
-"""Its vertical displacement at the middle of the free end by :func:`sag`; degrees 4 and 5 with 3 levels agree to 1e-4 [m]."""
+SAG = -0.19643
+"""Its vertical displacement at the middle of the free end by :func:`sag` [m]: -0.196417 with p = 5 and 3
+levels, -0.196420 with p = 4 and 4 levels; good to 1e-4."""
 
 # 2D: a strip of 10 x 1, E = 1, Neo-Hookean, with an even dead traction on its end
 SLENDER, LARGE_FORCE = (10.0, 1.0), 0.002
@@ -73,9 +75,9 @@ def at_end(model, u: np.ndarray, size: tuple[float, ...]) -> np.ndarray:
     return u[np.argmin(np.linalg.norm(model.rest_points - end, axis=1))]
 
 
-def heavy_beam(n: int, element: str) -> tuple[int, float]:
-    """Unknowns, and the sag by warpfem with n cubes across the height."""
-    mesh = wf.Mesh.box(SIZE, (4 * n, n, n))
+def heavy_beam(n: int, element: str, split: Literal[5, 6]) -> tuple[int, float]:
+    """Unknowns, and the sag by warpfem with n cubes of 5 or 6 tetrahedra across the height."""
+    mesh = wf.Mesh.box(SIZE, (4 * n, n, n), split=split)
     beam = body(mesh, wf.LinearElasticity(E=E, nu=NU), element, density=DENSITY, supports=[wf.Pin("left")])
     model = model_of(beam, gravity=(0.0, -GRAVITY, 0.0))
     unknowns = 3 * (model.point_count - model.supports.count)
@@ -96,23 +98,26 @@ def run(quick: bool) -> Iterator[Check | Table]:
         again = np.array(large_deflection(6, 3))
         yield at_most("the reference in 2D with p = 6", float(np.abs(again / LARGE - 1.0).max()), 2e-5)
     for element in ELEMENTS:
-        if not quick:
-            yield from _small(element)
-        yield from _large(element, (2, 4) if quick else (2, 4, 8, 16))
+        finest = 8 if element == "quadratic" else 16
+        for split in () if quick else (5, 6):
+            yield from _small(element, (finest // 4, finest // 2, finest), split)
+        yield from _large(element, (2, 4) if quick else (finest // 4, finest // 2, finest))
 
 
-def _small(element: str) -> Iterator[Check | Table]:
-    counts = (4, 8, 16)
-    found = [heavy_beam(n, element) for n in counts]
+def _small(element: str, counts: tuple[int, ...], split: Literal[5, 6]) -> Iterator[Check | Table]:
+    found = [heavy_beam(n, element, split) for n in counts]
     errors = [w / SAG - 1.0 for _, w in found]
     rows = [
         [f"{unknowns}", f"{w:.5f}", f"{100 * error:.1f} %"] for (unknowns, w), error in zip(found, errors, strict=True)
     ]
     rows.append(["exact", f"{SAG:.5f}", ""])
     rows.append(["Timoshenko's beam", f"{timoshenko():.5f}", f"{100 * (timoshenko() / SAG - 1):.1f} %"])
-    yield Table(f"Beam of 4 x 1 x 1 under its weight, {element}", ["unknowns", "sag of the end", "error"], rows)
-    order = orders([1.0 / n for n in counts], np.abs(errors).tolist())[-1]
-    yield between(f"order of the sag, {element}", order, 1.7, 2.3)
+    yield Table(
+        f"Beam of 4 x 1 x 1 under its weight, {split} {element} tetrahedra per cube",
+        ["unknowns", "sag of the end", "error"],
+        rows,
+    )
+    yield _converging(f"sag with {split} tetrahedra per cube", element, counts, np.abs(errors).tolist())
 
 
 def _large(element: str, counts: tuple[int, ...]) -> Iterator[Check | Table]:
@@ -127,11 +132,14 @@ def _large(element: str, counts: tuple[int, ...]) -> Iterator[Check | Table]:
     difference = np.linalg.norm(curve - LARGE) / np.linalg.norm(LARGE)
     rows.append(["elastica", *(f"{c:.4f}" for c in curve), f"{100 * difference:.2f} %"])
     yield Table(f"Strip of 10 x 1, bent by a force on its end, {element}", ["cells", "along", "across", "error"], rows)
-    shrinks = all(fine < coarse for coarse, fine in zip(errors, errors[1:], strict=False))
-    measured = ", ".join(f"{100 * error:.2g} %" for error in errors)
-    yield holds(f"error of the bent strip, {element}", shrinks, measured, "shrinks with every refinement")
-    if len(counts) > 2:
-        yield between(f"order of the bent strip, {element}", orders(1.0 / np.array(counts), errors)[-1], 1.7, 2.3)
+    yield _converging("bent strip", element, counts, errors)
+
+
+def _converging(what: str, element: str, counts: tuple[int, ...], errors: list[float]) -> Check:
+    """Linear cells converge with order 2; what limits quadratic ones is the singularity at the clamp."""
+    if element == "quadratic":
+        return at_most(f"error on the finest mesh, {what}, {element}", errors[-1], 3e-3)
+    return between(f"order, {what}, {element}", orders([1.0 / n for n in counts], errors)[-1], 1.7, 2.3)
 
 
 CASE = Case(
@@ -146,6 +154,9 @@ CASE = Case(
         "lower degree. For comparison: Timoshenko's beam with bending and shear, kappa = 5/6; and the elastica "
         "(Bisshopp and Drucker 1945, Q. Appl. Math. 3, 272), which neither stretches nor shears."
     ),
-    criterion="linear cells: the error falls with order 2 (1.7 to 2.3) between the two finest meshes.",
+    criterion=(
+        "linear cells: the error falls with order 2 (1.7 to 2.3) between the two finest meshes; quadratic cells: it is "
+        "below 0.3 % on the finest mesh, where the singularity at the clamp limits the order."
+    ),
     run=run,
 )

@@ -55,20 +55,23 @@ def settled(material: str, n: int, element: str) -> tuple[float, float]:
         if np.abs(state.velocity).max() * 100.0 < 1e-9:
             break
     shape = model.scene.bodies[0].mesh
-    _, weights, N, normals = boundary_quadrature(shape)
-    means = []
-    for sign in (-1.0, 1.0):
-        on_side = (sign * normals[:, 1:] > 0.5) * np.ones((len(normals), weights.shape[1]))
-        shares = boundary_loads(shape, on_side[..., None], weights, N)[:, 0]
-        means.append(float(shares @ state.displacement[:, 1] / shares.sum()))
-    return means[0], means[1]
+    shares = [side_shares(shape, sign) for sign in (-1.0, 1.0)]
+    bottom, top = (float(share @ state.displacement[:, 1] / share.sum()) for share in shares)
+    return bottom, top
+
+
+def side_shares(mesh: wf.Mesh, sign: float) -> np.ndarray:
+    """The integrals of the shape functions (n,) over the faces that look down, sign -1, or up, +1."""
+    _, weights, N, normals = boundary_quadrature(mesh)
+    on_side = np.broadcast_to((sign * normals[:, 1] > 0.9)[:, None, None], (*weights.shape, 1))
+    return boundary_loads(mesh, on_side.astype(float), weights, N)[:, 0]
 
 
 def pressed(n: int, element: str) -> tuple[np.ndarray, np.ndarray, float]:
     """A disc pressed into half a block, symmetric about x = 0, by warpfem.
 
     Returns:
-        Places x of the corners on the top, their contact pressures, and the force on the whole block [N/m].
+        Places x of the points on the top, their contact pressures, and the force on the whole block [N/m].
     """
 
     def place(x: np.ndarray) -> np.ndarray:
@@ -81,14 +84,11 @@ def pressed(n: int, element: str) -> tuple[np.ndarray, np.ndarray, float]:
     disc = wf.Sphere((0.0, RADIUS - INDENTATION), RADIUS, stiffness=DISC_STIFFNESS)
     model = model_of(block, obstacles=[disc])
     state = solved(model, tolerance=1e-8)
-    top = model.scene.bodies[0].mesh.point_sets["top"]
+    mesh = model.scene.bodies[0].mesh
+    top = mesh.point_sets["top"]
     top = top[np.argsort(model.rest_points[top, 0])]
-    x = model.rest_points[top, 0]
     force = -model.internal_force(state)[top, 1]  # of the disc on the points, downwards
-    widths = np.zeros(len(x))
-    widths[1:] += 0.5 * np.diff(x)
-    widths[:-1] += 0.5 * np.diff(x)
-    return x, -force / widths, -2.0 * float(force.sum())
+    return model.rest_points[top, 0], -force / side_shares(mesh, 1.0)[top], -2.0 * float(force.sum())
 
 
 def run(quick: bool) -> Iterator[Check | Table]:

@@ -11,16 +11,16 @@ import warpfem as wf
 from warpfem.materials import Material
 from warpfem.model import Model, State
 
-ELEMENTS = ("linear",)
+ELEMENTS = ("linear", "quadratic")
 """The kinds of elements that the cases go over."""
 
-ORDERS = {"linear": (2, 1)}
+ORDERS = {"linear": (2, 1), "quadratic": (3, 2)}
 """Order of convergence in L2 and in H1 of smooth solutions."""
 
 
 def body(mesh: wf.Mesh, material: Material, element: str = "linear", **settings: Any) -> wf.Body:
     """A body of that kind of element."""
-    return wf.Body("body", mesh, material, **settings)
+    return wf.Body("body", mesh, material, element=element, **settings)
 
 
 def model_of(bodies: wf.Body | Sequence[wf.Body], **scene: Any) -> Model:
