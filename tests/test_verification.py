@@ -59,7 +59,7 @@ def test_free_stretch_bears_its_stress(name):
 
 
 def test_spectral_elements_solve_a_polynomial_exactly():
-    # u = (xy, 0): eps = [[y, x/2], [x/2, 0]]; sigma = [[(2 mu + lam) y, mu x], [mu x, lam y]]; Div sigma = (0, mu + lam)
+    # u = (xy, 0): sigma = [[(2 mu + lam) y, mu x], [mu x, lam y]] and Div sigma = (0, mu + lam)
     mu, lam = 1.0, 2.0
     grid = box((2.0, 1.0), [graded(2), graded(2)], 3)
     inner = (~np.isclose(grid.points, 0.0) & ~np.isclose(grid.points, (2.0, 1.0))).all(axis=1)

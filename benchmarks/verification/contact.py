@@ -147,13 +147,13 @@ CASE = Case(
     ),
     reference=(
         "the column: the balance in one dimension, integrated by Gauss quadrature. The disc: Hertz's line contact, "
-        "a^2 = 4 P R/(pi E*), p0 = 2 P/(pi a), E* = E/(1 - nu^2) (Johnson, Contact mechanics, 1985, section 4.2), from the "
-        "force P that is found. Hertz has a half-space and a parabola, good to (a/H)^2 = 0.6 % here."
+        "a^2 = 4 P R/(pi E*), p0 = 2 P/(pi a), E* = E/(1 - nu^2) (Johnson, Contact mechanics, 1985, section 4.2), from "
+        "the force P that is found. Hertz has a half-space and a parabola, good to (a/H)^2 = 0.6 % here."
     ),
     criterion=(
-        "the mean over the bottom is right to 1e-6, so is that over the top where the column is linear (a linear field does "
-        "work on it, and that is in the space of every element); else its error falls at least with order 1.8; peak pressure and "
-        "half-width within 1 % of Hertz's."
+        "the mean over the bottom is right to 1e-6, so is that over the top where the column is linear (a linear field "
+        "does work on it, and that is in the space of every element); else its error falls at least with order 1.8; "
+        "peak pressure and half-width within 1 % of Hertz's."
     ),
     run=run,
 )

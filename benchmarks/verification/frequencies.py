@@ -115,8 +115,8 @@ CASE = Case(
     name="frequencies",
     title="Natural frequencies of a free block",
     what=(
-        "The lowest five natural frequencies of a free block of 1 x 0.7 (x 1, plane strain) and of 1 x 0.8 x 0.6, E = 1, "
-        "nu = 0.3, density 1, from the stiffness at rest and the lumped mass."
+        "The lowest five natural frequencies of a free block of 1 x 0.7 (x 1, plane strain) and of 1 x 0.8 x 0.6, E = "
+        "1, nu = 0.3, density 1, from the stiffness at rest and the lumped mass."
     ),
     reference=(
         "Ritz's method with Legendre polynomials (after Visscher et al. 1991, J. Acoust. Soc. Am. 90, 2154), in NumPy; "

@@ -126,9 +126,9 @@ CASE = Case(
     name="homogeneous",
     title="Homogeneous deformations of every material",
     what=(
-        "One cell of each material, E = 1: P at all pairs of 12 stretches from 0.1 to 10 and at simple shears up to 10; "
-        "and its static equilibrium where one or two stretches are given and the other sides bear a nominal stress of "
-        "0.01 (uniaxial, equibiaxial, planar: in 2D plane strain and in 3D with the third stretch held at 1)."
+        "One cell of each material, E = 1: P at all pairs of 12 stretches from 0.1 to 10 and at simple shears up to "
+        "10; and its static equilibrium where one or two stretches are given and the other sides bear a nominal stress "
+        "of 0.01 (uniaxial, equibiaxial, planar: in 2D plane strain and in 3D with the third stretch held at 1)."
     ),
     reference=(
         "P_i = d psi/d s_i by hand from the energies that the materials' docstrings cite, in principal stretches; the "

@@ -101,8 +101,8 @@ CASE = Case(
     name="spin",
     title="Free spin",
     what=(
-        "A free Neo-Hookean square and cube of 1 m (E = 1e6, nu = 0.3, density 1000) in steady spin with its centrifugal "
-        "stretch, for 1 s; explicit steps at 0.9 of their stability limit."
+        "A free Neo-Hookean square and cube of 1 m (E = 1e6, nu = 0.3, density 1000) in steady spin with its "
+        "centrifugal stretch, for 1 s; explicit steps at 0.9 of their stability limit."
     ),
     reference=(
         "explicit steps keep the angular momentum exactly, since their forces have no torque about the places at which "
