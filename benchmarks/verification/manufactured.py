@@ -10,9 +10,10 @@ import numpy as np
 import warpfem as wf
 from verification.core import Case, Check, Table, between, orders
 from verification.hyperelastic import STRESSES, Stress
-from verification.models import ELEMENTS, ORDERS, body, model_of, point_forces, solved
+from verification.models import ORDERS, body, model_of, point_forces, solved
 from verification.simplex import Field, boundary_loads, boundary_quadrature
 from warpfem.materials import HookeanMaterial
+from warpfem.scene import ELEMENTS
 
 MATERIALS = {"linear": wf.LinearElasticity, "neo_hookean": wf.NeoHookean}
 E, NU = 1.0, 0.3

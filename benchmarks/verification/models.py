@@ -10,11 +10,12 @@ import numpy as np
 import warpfem as wf
 from warpfem.materials import Material
 from warpfem.model import Model, State
+from warpfem.scene import ELEMENTS
 
-ELEMENTS = ("linear", "quadratic")
-"""The kinds of elements that the cases go over."""
+SEPARATE_ELEMENTS = tuple(element for element in ELEMENTS if element != "averaged")
+"""The kinds of elements whose cells are coupled by their points alone."""
 
-ORDERS = {"linear": (2, 1), "quadratic": (3, 2)}
+ORDERS = {"linear": (2, 1), "quadratic": (3, 2), "averaged": (2, 1)}
 """Order of convergence in L2 and in H1 of smooth solutions."""
 
 

@@ -107,8 +107,8 @@ CASE = Case(
         "explicit steps keep the angular momentum exactly, since their forces have no torque about the places at which "
         "they are taken, and so does the implicit midpoint rule, as it does all quadratic invariants (Hairer, Lubich "
         "and Wanner, Geometric numerical integration, 2006, theorem IV.2.1); for exact backward Euler steps of a rigid "
-        "body tan(a') = sin(a)/(2 - cos(a)) for the angles of two steps (derived in benchmarks/verification/spin.py). For "
-        "the others no theory is claimed."
+        "body tan(a') = sin(a)/(2 - cos(a)) for the angles of two steps (derived in benchmarks/verification/spin.py). "
+        "For the others no theory is claimed."
     ),
     criterion=(
         "explicit: kept to 1e-11; implicit midpoint, whose steps are solved to 1e-8: to 1e-6; backward Euler: within "
