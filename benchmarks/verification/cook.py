@@ -28,7 +28,8 @@ class Setting:
         material: by its name.
         E, nu: of the material [Pa], [1].
         force: total upward force on the right side [N/m].
-        middle, top: upward displacements at (48, 52) and (48, 60) by :func:`reference` with p = 8 and 5 levels [m].
+        middle, top: upward displacements at (48, 52) and (48, 60) by :func:`reference` [m]: with p = 8 and 5
+            levels if linear, else with p = 7 and 4 levels, and at nu = 0.4999 with p = 6, 4 levels and 40 steps.
         steps: of the load, for that.
         limits: largest relative error at (48, 52) on the finest mesh, by kind of element.
     """
@@ -51,7 +52,7 @@ SETTINGS = (
     Setting(
         "Neo-Hookean, nu = 0.3", "neo_hookean", 1.0, 0.3, 0.25, 5.03867, 5.08744, 8, {"linear": 0.01, "quadratic": 5e-4}
     ),
-    Setting("Neo-Hookean, nu = 0.4999", "neo_hookean", 1.0, 0.4999, 0.25, 4.364, 4.435, 40, {}),
+    Setting("Neo-Hookean, nu = 0.4999", "neo_hookean", 1.0, 0.4999, 0.25, 4.36387, 4.43501, 20, {}),
 )
 
 
@@ -80,7 +81,7 @@ def deflections(setting: Setting, n: int, element: str) -> tuple[float, float]:
     material = wf.MATERIALS[setting.material](E=setting.E, nu=setting.nu)
     loads = [wf.Traction("right", (0.0, setting.force / SIDE))]
     model = model_of(body(membrane(n), material, element, supports=[wf.Pin("left")], loads=loads))
-    u = solved(model, tolerance=1e-8).displacement
+    u = solved(model, tolerance=1e-6).displacement
 
     def at(y: float) -> float:
         return float(u[np.argmin(np.linalg.norm(model.rest_points - (48.0, y), axis=1)), 1])
@@ -89,8 +90,9 @@ def deflections(setting: Setting, n: int, element: str) -> tuple[float, float]:
 
 
 def run(quick: bool) -> Iterator[Check | Table]:
-    counts = (8, 16) if quick else (8, 16, 32, 64)
     for setting in SETTINGS:
+        stiff = setting.nu > 0.49  # conjugate gradients take thousands of iterations
+        counts = (8, 16) if quick else (4, 8, 16) if stiff else (8, 16, 32, 64)
         if quick and setting.name != "linear, classic":
             continue
         if not quick:
@@ -132,9 +134,9 @@ CASE = Case(
         "E = 0.9375, nu = 0.25 has the same in-plane stiffness. The others: E = 1, and forces of 1 (linear) and 0.25."
     ),
     reference=(
-        "spectral elements of degree 8 graded geometrically towards the sides (benchmarks/verification/spectral.py), "
-        "recomputed here with degree 6; for the classic case 23.96 in the literature (Cook, Malkus and Plesha, "
-        "Concepts and applications of finite element analysis, 1989)."
+        "spectral elements of degrees 6 to 8, graded geometrically towards the sides "
+        "(benchmarks/verification/spectral.py), recomputed here with degree 6 and less grading; for the classic case "
+        "23.96 in the literature (Cook, Malkus and Plesha, Concepts and applications of finite element analysis, 1989)."
     ),
     criterion=(
         "the error falls with every refinement, and where the material is compressible it is below 1 % on 64 x 64 "

@@ -72,12 +72,9 @@ def kept(model: Model, solver: Solver, omega: float, dt: float) -> float:
 def run(quick: bool) -> Iterator[Check | Table]:
     rows = []
     for dim in (3,) if quick else (2, 3):
-        n = 2 if quick else 4
-        mesh = (
-            wf.Mesh.rectangle((1, 1), (n, n), origin=(-0.5, -0.5))
-            if dim == 2
-            else wf.Mesh.box((1, 1, 1), (n, n, n), origin=(-0.5, -0.5, -0.5))
-        )
+        n = 2 if quick else 3
+        corner, kind = (-0.5,) * dim, wf.Mesh.rectangle if dim == 2 else wf.Mesh.box
+        mesh = kind((1.0,) * dim, (n,) * dim, origin=corner)
         model = model_of(body(mesh, wf.NeoHookean(E=E, nu=NU), density=DENSITY))
         for omega in (5.0,) if quick else (2.0, 5.0):
             where = f"omega = {omega:g}, {dim}D"
