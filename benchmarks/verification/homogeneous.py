@@ -17,9 +17,6 @@ SHEARS = (0.1, 0.3, 1.0, 3.0, 10.0)
 Setting = tuple[str, float, float]
 """A mode, the given stretch and the free stretch of the closed form."""
 
-LATERAL = 0.01
-"""Nominal stress on the free sides: without any load the relative residual has no scale but rounding."""
-
 OFFSET = 1.03
 """Factor of the free stretches at which static solves start."""
 
@@ -61,10 +58,7 @@ def equilibrated(material: HookeanMaterial, settings: list[Setting], dim: int) -
         for axis in range(dim):
             own = [i for i in range(dim) if not (i == axis and axis in axes)]
             supports.append(wf.PrescribedMotion([axis + 1], move, axes=own))
-        loads = [
-            wf.PointForce([axis + 1], LATERAL * mesh.cell_volumes[0] * np.eye(dim)[axis]) for axis in axes if axis < dim
-        ]
-        bodies.append(wf.Body(f"{number}", mesh, material, supports=supports, loads=loads))
+        bodies.append(wf.Body(f"{number}", mesh, material, supports=supports))
         starts.append(mesh.points @ goal - mesh.points)
         free_axis.append(axes[0])
     model = model_of(bodies)
@@ -77,19 +71,23 @@ def equilibrated(material: HookeanMaterial, settings: list[Setting], dim: int) -
 def run(quick: bool) -> Iterator[Check | Table]:
     rows = []
     for name in ("linear", "neo_hookean") if quick else tuple(CLOSED_FORMS):
-        for nu in (0.3,) if quick else (0.1, 0.3, 0.49):
+        for nu in (0.3,) if quick else (0.0, 0.3, 0.49):
             material = wf.MATERIALS[name](E=1.0, nu=nu)
             where = f"{name}, nu = {nu:g}"
             for dim in (2, 3):
                 yield from _by_evaluation(material, f"{where}, {dim}D", dim)
             for mode in MODES:
                 moduli = float(material.mu), float(material.lam)
-                roots = [(mode, s, free_stretch(name, mode, s, *moduli, LATERAL)) for s in STRETCHES]
+                roots = [(mode, s, free_stretch(name, mode, s, *moduli)) for s in STRETCHES]
                 settings = [(mode, s, root) for mode, s, root in roots if root is not None]
                 rows.append([name, f"{nu:g}", mode, f"{settings[0][1]:g} to {settings[-1][1]:g}"])
                 for dim in (2, 3) if mode == "planar" else (3,):
                     yield _by_equilibrium(material, settings, f"{mode}, {where}, {dim}D", dim)
-    yield Table("Stretches of 0.1 to 10 that have an equilibrium", ["material", "nu", "mode", "stretches"], rows)
+    yield Table(
+        "Stretches of 0.1 to 10 that have a stable equilibrium of positive stretches",
+        ["material", "nu", "mode", "stretches"],
+        rows,
+    )
 
 
 def _by_evaluation(material: HookeanMaterial, where: str, dim: int) -> Iterator[Check]:
@@ -127,8 +125,8 @@ CASE = Case(
     title="Homogeneous deformations of every material",
     what=(
         "One cell of each material, E = 1: P at all pairs of 12 stretches from 0.1 to 10 and at simple shears up to "
-        "10; and its static equilibrium where one or two stretches are given and the other sides bear a nominal stress "
-        "of 0.01 (uniaxial, equibiaxial, planar: in 2D plane strain and in 3D with the third stretch held at 1)."
+        "10; and its static equilibrium where one or two stretches are given and the others are free (uniaxial, "
+        "equibiaxial, planar: in 2D plane strain and in 3D with the third stretch held at 1)."
     ),
     reference=(
         "P_i = d psi/d s_i by hand from the energies that the materials' docstrings cite, in principal stretches; the "

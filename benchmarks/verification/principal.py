@@ -99,17 +99,18 @@ def stretches(mode: str, given: float, free: float) -> tuple[float, float, float
     return (given, given, free) if mode == "equibiaxial" else (given, free, 1.0)
 
 
-def free_stretch(name: str, mode: str, given: float, mu: float, lam: float, stress: float) -> float | None:
-    """The free stretch > 0 with a given nominal stress along its axis, by bisection; None if there is none.
+def free_stretch(name: str, mode: str, given: float, mu: float, lam: float) -> float | None:
+    """The free stretch > 0 with no stress along its axis, by bisection; None if there is none that is stable.
 
-    Of several, the one that follows from rest as ``given`` grows or falls.
+    Of several, the one that follows from rest as ``given`` grows or falls. Two free stretches are equal; that is not
+    stable where energy falls if one grows and the other shrinks, as in a fixed corotated bar stretched tenfold.
     """
     form = CLOSED_FORMS[name]
     axis = {"uniaxial": 1, "equibiaxial": 2, "planar": 1}[mode]
 
     def residual(s_given: float, s_free: float) -> float:
         s = stretches(mode, s_given, s_free)
-        return float(form.principal((s[axis], *(s[:axis] + s[axis + 1 :])), mu, lam)) - stress
+        return float(form.principal((s[axis], *(s[:axis] + s[axis + 1 :])), mu, lam))
 
     root = 1.0
     for at in np.geomspace(1.0, given, 200):  # follow the branch: widen a bracket about the last root
@@ -124,4 +125,8 @@ def free_stretch(name: str, mode: str, given: float, mu: float, lam: float, stre
             middle = 0.5 * (low + high)
             low, high = (middle, high) if residual(at, middle) < 0.0 else (low, middle)
         root = 0.5 * (low + high)
+    if mode == "uniaxial":
+        wide, narrow = 1.00001 * root, 0.99999 * root
+        if form.principal((wide, given, narrow), mu, lam) <= form.principal((narrow, given, wide), mu, lam):
+            return None
     return root

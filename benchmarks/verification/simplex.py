@@ -17,7 +17,7 @@ EDGES = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3)
 
 
 @cache
-def quadrature(dim: int, points: int = 5) -> tuple[np.ndarray, np.ndarray]:
+def quadrature(dim: int, points: int = 4) -> tuple[np.ndarray, np.ndarray]:
     """Barycentric points (q, dim + 1) and weights (q,) that sum to 1.
 
     The product of Gauss-Jacobi rules on the collapsed cube (Stroud 1971), exact to degree 2 points - 1.
@@ -66,7 +66,7 @@ class Field:
         dN: their gradients (cells, q, points of a cell, dim).
     """
 
-    def __init__(self, mesh: Mesh, points: int = 5) -> None:
+    def __init__(self, mesh: Mesh, points: int = 4) -> None:
         b, w = quadrature(mesh.dim, points)
         corners = mesh.points[mesh.cells[:, : mesh.dim + 1]]
         spans = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -93,7 +93,7 @@ class Field:
         return _gathered(self.mesh, self.mesh.cells, own)
 
 
-def boundary_quadrature(mesh: Mesh, points: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def boundary_quadrature(mesh: Mesh, points: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Quadrature on the boundary faces.
 
     Returns:
