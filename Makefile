@@ -1,13 +1,14 @@
 # make demo   install, run a real scene, and say where its USD file and picture are
 # make test   install and run the tests on the CPU
 # make slow   the long checks too
+# make verify the verification suite, which writes docs/accuracy.md
 # make lint   style and types
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow lint clean
+.PHONY: demo test slow verify lint clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -31,6 +32,9 @@ test: $(VENV)/extras
 
 slow: $(VENV)/extras
 	$(BIN)/python -m pytest -m 'slow or not slow'
+
+verify: $(VENV)/installed
+	$(BIN)/python benchmarks/verification --out docs/accuracy.md
 
 lint: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
