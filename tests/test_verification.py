@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("scipy", reason="the verification suite needs the extra 'bench'")
+pytest.importorskip("skfem", reason="the verification suite needs the extra 'bench'")
+
 from verification import report
 from verification.cases import CASES
 from verification.core import Case, Check, Table, at_most, between, orders, run_case
