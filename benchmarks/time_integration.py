@@ -32,9 +32,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from candidates import BDF2, TRBDF2, Crouzeix, GeneralisedAlpha, Trapezoidal
 
 import warpfem as wf
-from candidates import BDF2, TRBDF2, Crouzeix, GeneralisedAlpha, Trapezoidal
 from warpfem.model import Model, State
 from warpfem.solvers import Solver
 from warpfem.solvers.error_control import controlled_step
