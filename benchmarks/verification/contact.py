@@ -109,6 +109,8 @@ def run(quick: bool) -> Iterator[Check | Table]:
             yield at_most(f"sinking of the bottom, {where}", abs(found[-1][0] / exact[0] - 1.0), 1e-6)
             if material == "linear":
                 yield at_most(f"sinking of the top, {where}", errors[-1], 1e-6)
+            elif element == "averaged":  # its error changes sign, so that it has no order on these meshes
+                yield at_most(f"sinking of the top, {where}", errors[-1], 1e-4)
             else:
                 yield between(
                     f"order of the top's error, {where}", orders([1 / n for n in counts], errors)[-1], 1.8, 5.0
@@ -153,8 +155,9 @@ CASE = Case(
     ),
     criterion=(
         "the mean over the bottom is right to 1e-6, so is that over the top where the column is linear (a linear field "
-        "does work on it, and that is in the space of every element); else its error falls at least with order 1.8; "
-        "peak pressure and half-width within 1 % of Hertz's."
+        "does work on it, and that is in the space of every element); else its error falls at least with order 1.8, "
+        "or with averaged cells, where it changes sign, is at most 1e-4; peak pressure and half-width within 1 % of "
+        "Hertz's."
     ),
     run=run,
 )
