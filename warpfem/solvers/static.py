@@ -22,6 +22,10 @@ LEAST_INCREMENT = 2.0**-8
 INCREMENT_ITERATIONS = 100
 """Newton iterations after which an increment is halved."""
 
+LINEAR_ITERATIONS = 20_000
+"""Limit of conjugate gradients for one linear solve: without inertia, nearly incompressible or slender bodies take
+thousands, and each solve that is cut short begins anew."""
+
 MOST_BEND = 0.21
 """How far supports may stray from the straight within an increment, relative to their way: a turn by 90 degrees."""
 
@@ -130,7 +134,9 @@ class StaticEquilibrium:
         end = state.time if time is None else time
         straight = model.supports is None or model.supports.bend(end, 0.0, 1.0) <= MOST_BEND
         if self.load_steps == 1 and straight:
-            newton = _StaticNewton(model, NewtonSettings(self.tolerance, self.max_iterations))
+            newton = _StaticNewton(
+                model, NewtonSettings(self.tolerance, self.max_iterations, linear_iterations=LINEAR_ITERATIONS)
+            )
             if model.supports is not None:
                 model.supports.advance(end, 0.0)
             try:
@@ -153,7 +159,7 @@ class StaticEquilibrium:
             loaded.dead_load = wp.clone(model.dead_load)
             full = model.dead_load.numpy().copy()
         iterations = min(self.max_iterations, INCREMENT_ITERATIONS)
-        newton = _StaticNewton(loaded, NewtonSettings(self.tolerance, iterations))
+        newton = _StaticNewton(loaded, NewtonSettings(self.tolerance, iterations, linear_iterations=LINEAR_ITERATIONS))
         state.u.zero_()
         state.v.zero_()
         longest = 1.0 / self.load_steps
