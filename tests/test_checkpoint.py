@@ -59,7 +59,8 @@ def pushed_block(solver: wf.solvers.base.Solver = SOLVERS["velocity_verlet"], **
         "loads": [wf.Traction("left", (50.0, 0.0))],
         "velocity": (0.1, 0.0),
     }
-    body |= {name: settings.pop(name) for name in list(settings) if name in (*body, "density", "displacement")}
+    own = (*body, "density", "displacement", "element")
+    body |= {name: settings.pop(name) for name in list(settings) if name in own}
     floor = settings.pop("floor", wf.Plane((0.0, 0.0), (0.0, 1.0), friction=0.4))
     return wf.Scene([wf.Body("block", **body)], solver, obstacles=[floor], **settings)
 
@@ -263,6 +264,7 @@ DIFFERENT = {
     "the names of the bodies": other_bodies,
     "body 'block': the mesh": lambda: pushed_block(mesh=wf.Mesh.rectangle((1.0, 0.5), (4, 2), (0.0, 0.011))),
     "body 'block': the material": lambda: pushed_block(material=wf.StableNeoHookean(E=2e4, nu=0.31)),
+    "body 'block': the element": lambda: pushed_block(element="averaged"),
     "body 'block': the density": lambda: pushed_block(density=1001.0),
     "body 'block': the supports": lambda: pushed_block(supports=[wf.PrescribedMotion("top", push, axes=(0,))]),
     "body 'block': the prescribed motion": lambda: pushed_block(supports=[wf.PrescribedMotion("top", press)]),

@@ -515,6 +515,23 @@ def test_a_body_says_what_its_cells_are():
         wf.Body("block", block(2), material, element="cubic")
 
 
+def test_listed_points_are_held_and_loaded_with_the_midpoints_between_them():
+    mesh = block(2)
+    left, right = mesh.select_points("left"), mesh.select_points("right")
+
+    def model(left, right):
+        supports, loads = [wf.Pin(left)], [wf.Traction(right, (1.0, 0.0)), wf.PointForce([0], (0.0, 2.0))]
+        body = wf.Body("b", mesh, wf.StableNeoHookean(E, NU), supports=supports, loads=loads, element="quadratic")
+        return Model(wf.Scene([body], wf.BackwardEuler()), dtype="float64")
+
+    named, listed = model("left", "right"), model(left, right)
+    np.testing.assert_array_equal(listed.supports.host_points, named.supports.host_points)
+    assert len(listed.supports.host_points) == 5
+    np.testing.assert_array_equal(listed.dead_load.numpy(), named.dead_load.numpy())
+    with pytest.raises(SceneError, match=r"'b', Pin: .* refers to point 99"):
+        model([0, 99], right)
+
+
 def test_linear_scenes_compile_nothing_of_quadratic_cells():
     model = model_of(wf.StableNeoHookean(E, NU), block(2))
     assert model.blocks[0].kernels is element_kernels(wf.StableNeoHookean.functions, shape(2, 1), "float64")

@@ -21,6 +21,17 @@ def solved(body, **settings):
     return model, state
 
 
+def test_forces_that_float32_does_not_resolve_are_warned_of():
+    """A strip a hundred times as long as high, whose internal forces are far larger than its weight."""
+    mesh = Mesh.rectangle((100.0, 1.0), (100, 2))
+    body = Body("strip", mesh, NeoHookean(E=1e6, nu=0.3), supports=[Pin("left")])
+    scene = Scene([body], BackwardEuler(), gravity=(0.0, -0.2))
+    model = Model(scene, device="cpu", dtype="float32")
+    with pytest.warns(UserWarning, match=r'only to a residual of .*: take dtype="float64"'):
+        report = StaticEquilibrium().solve(model, model.state())
+    assert report.residual > 1e-3
+
+
 def test_uniaxial_stretch_of_a_neo_hookean_bar():
     material = NeoHookean(E=1e5, nu=0.3)
     mesh = Mesh.box((2.0, 1.0, 1.0), (2, 1, 1))

@@ -85,6 +85,9 @@ class PrescribedMotion:
 class PointForce:
     """A constant force on each of the points.
 
+    It is meant for single points: the more points a set has, the larger the load, and a quadratic body has midpoints
+    too. For a load that is spread over faces take :class:`Traction`.
+
     Attributes:
         points: name of a point set, or point indices.
         force: force on each point [N] (2D: per metre of thickness, [N/m]).

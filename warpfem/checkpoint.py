@@ -214,6 +214,7 @@ def _places(body: Body, support: PrescribedMotion, time: float) -> list[np.ndarr
 
 def _body_parts(body: Body) -> Iterator[tuple[str, Any]]:
     yield "the mesh", [body.mesh.points, body.mesh.cells]
+    yield "the element", body.element
     yield "the material", _material(body.material, body.mesh.cell_count)
     yield "the density", body.density
     yield "the supports", [_support(body, support) for support in body.supports]

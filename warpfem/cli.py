@@ -19,6 +19,7 @@ from pathlib import Path
 
 import warpfem
 from warpfem.checkpoint import Checkpoint, checkpoint_path
+from warpfem.dtypes import FloatName
 from warpfem.errors import OutputError, SimulationError, TimeStepError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
@@ -34,6 +35,8 @@ EXTRAS = {
     "matplotlib": "plot",
     "pillow": "plot",
     "tqdm": "progress",
+    "scipy": "bench",
+    "scikit-fem": "bench",
 }
 """Optional packages and the extra that brings them."""
 
@@ -93,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     static = commands.add_parser(
         "static", help="solve a scene's static equilibrium and store it", description=_static.__doc__
     )
-    _scene_options(static)
+    _scene_options(static, dtype="float64")
     static.set_defaults(frames=None, fps=None)
     static.add_argument(
         "--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.static.usdc)"
@@ -167,10 +170,10 @@ def _positive(text: str) -> int:
 _positive.__name__ = "number of frames"  # argparse's name for what is no number
 
 
-def _scene_options(parser: argparse.ArgumentParser) -> None:
+def _scene_options(parser: argparse.ArgumentParser, dtype: FloatName = "float32") -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
     parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
-    parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="default: float32")
+    parser.add_argument("--dtype", choices=("float32", "float64"), default=dtype, help=f"default: {dtype}")
     parser.add_argument(
         "--set",
         action="append",

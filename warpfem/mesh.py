@@ -253,13 +253,22 @@ class Mesh:
             _row_keys(np.sort(self.cells[:, own.edges].reshape(-1, 2), axis=1), self.point_count),
         )
         middles = self.point_count + places.reshape(self.cell_count, -1).astype(np.int32)
-        sets = {}
-        for name, members in self.point_sets.items():
-            chosen = np.zeros(self.point_count, dtype=bool)
-            chosen[members] = True
-            sets[name] = np.concatenate([members, self.point_count + np.flatnonzero(chosen[self.edges].all(axis=1))])
+        sets = {name: self.with_midpoints(members) for name, members in self.point_sets.items()}
         points = np.concatenate([self.points, self.points[self.edges].mean(axis=1)])
         return Mesh(points, np.concatenate([self.cells, middles], axis=1), sets, self.cell_sets)
+
+    def with_midpoints(self, members: np.ndarray) -> np.ndarray:
+        """Return points of this linear mesh, and the midpoints between them by their numbers in :meth:`quadratic`.
+
+        Args:
+            members: point indices, (k,) int.
+
+        Returns:
+            (j,) int.
+        """
+        chosen = np.zeros(self.point_count, dtype=bool)
+        chosen[members] = True
+        return np.concatenate([members, self.point_count + np.flatnonzero(chosen[self.edges].all(axis=1))])
 
     # ---- sets
 

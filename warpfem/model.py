@@ -85,7 +85,7 @@ class Energies:
     Attributes:
         kinetic: sum of m |v|^2 / 2.
         elastic: volume-weighted energy density; infinite if a cell of a barrier material has J <= 0.
-        load: potential of gravity and dead loads, 0 at rest shape.
+        load: potential of gravity and dead loads, 0 at rest shape; gravity is shared as in :attr:`Model.dead_load`.
         contact: penalty energy of the obstacles.
     """
 

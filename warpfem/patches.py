@@ -21,7 +21,8 @@ def cell_patches(mesh: Mesh, modulus: np.ndarray) -> np.ndarray:
 
     Args:
         mesh: the mesh.
-        modulus: (cell_count,) float64, > 0. Cells whose moduli differ by more than ``LARGEST_RATIO`` are kept apart.
+        modulus: (cell_count,) float64, > 0. Neighbours whose moduli differ by more than ``LARGEST_RATIO`` are
+            kept apart, where no others lead from one to the other.
 
     Returns:
         (cell_count,) int32, the patch of each cell, numbered in the order of their first cells.

@@ -88,7 +88,8 @@ class Reactions:
 def reactions(model: Model, state: State, acceleration: np.ndarray | None = None) -> Reactions:
     """The forces that supports and obstacles exert in a state.
 
-    Without accelerations they are those of a static equilibrium. After a step of :class:`BackwardEuler` that was
+    Without accelerations they are those of a static equilibrium, in which quadratic cells share gravity by shape
+    functions; for a state that time steps have brought to rest give accelerations of zero. After a step of :class:`BackwardEuler` that was
     taken whole, ``(state.velocity - velocity_before) / dt`` gives those of that step; other schemes put their forces
     and their velocities at different times.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from warpfem.boundary import Load, Obstacle, Support, Vector, is_number
+from warpfem.boundary import Load, Obstacle, Pin, PrescribedMotion, Support, Traction, Vector, is_number
 from warpfem.errors import SceneError, source_of, user_code
 from warpfem.materials import HookeanMaterial, Material
 from warpfem.mesh import Mesh
@@ -49,7 +49,8 @@ class Body:
         loads: point forces and tractions.
         element: "linear", "quadratic" or "averaged"; ``None`` takes the mesh as it is. "quadratic" gives a linear mesh
             midpoints (:meth:`Mesh.quadratic`), and :attr:`mesh` is then the quadratic one, to which arrays per point
-            refer: several times the cost, for an accuracy that linear cells reach at a hundred times the cost or
+            refer. Points that pins, motions and tractions list by number gain the midpoints between them, as named
+            sets do. Several times the cost, for an accuracy that linear cells reach at a hundred times the cost or
             never. "averaged" cells are linear and share their volume change with some neighbours: about as accurate
             for nu near 0.5 as linear ones are for nu = 0.3.
         displacement: initial displacement [m]: one vector for all points, an array (point_count, dim), or a
@@ -77,9 +78,9 @@ class Body:
                 f"body '{self.name}': material must be a warpfem material, for example "
                 f"StableNeoHookean(E=1e5, nu=0.45), not {self.material!r}"
             )
-        self._choose_element()
         for name in ("supports", "loads"):
             _require_list(f"body '{self.name}': {name}", getattr(self, name))
+        self._choose_element()
         try:
             density = np.array(self.density, dtype=np.float64)  # a copy, as of all that a caller may change later
         except (TypeError, ValueError, OverflowError):
@@ -108,7 +109,10 @@ class Body:
             known = ", ".join(map(repr, ELEMENTS[:-1])) + f" or {ELEMENTS[-1]!r}"
             raise SceneError(f"body '{self.name}': element must be {known}, not {self.element!r}")
         elif self.element == "quadratic":
-            object.__setattr__(self, "mesh", self.mesh.quadratic())
+            if order == 1:
+                for name in ("supports", "loads"):
+                    object.__setattr__(self, name, [self._with_midpoints(term) for term in getattr(self, name)])
+                object.__setattr__(self, "mesh", self.mesh.quadratic())
         elif order == 2:
             raise SceneError(
                 f"body '{self.name}': element='{self.element}', but the mesh is quadratic: leave it out, or give the "
@@ -134,6 +138,16 @@ class Body:
                 f"body '{self.name}': element='averaged' is for nu >= {LEAST_AVERAGED_NU:g}, and the nu{where} is "
                 f"{nu:g}: take element='linear', which does not lock there"
             )
+
+    def _with_midpoints(self, term: object) -> object:
+        """The term with the midpoints between the points of the linear mesh that it lists; sets have theirs."""
+        if not isinstance(term, Pin | PrescribedMotion | Traction) or isinstance(term.points, str):
+            return term
+        try:
+            members = self.mesh.select_points(term.points)
+        except ValueError:
+            return term  # refused where its body is named
+        return replace(term, points=self.mesh.with_midpoints(members))
 
     def initial_displacement(self) -> np.ndarray:
         """Initial displacement, (point_count, dim) float64 [m]."""

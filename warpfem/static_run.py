@@ -101,7 +101,7 @@ class StaticRun:
         solver: the settings.
         time: when prescribed motions are held [s]; ``None`` for the time of the last frame.
         device: Warp device, for example "cpu" or "cuda:0"; ``None`` takes Warp's default.
-        dtype: "float32" or "float64".
+        dtype: "float64", or "float32", whose rounding can hide what is left of the forces.
 
     Attributes:
         scene: the scene.
@@ -120,7 +120,7 @@ class StaticRun:
         *,
         time: float | None = None,
         device: str | None = None,
-        dtype: FloatName = "float32",
+        dtype: FloatName = "float64",
     ) -> None:
         start = _now()
         end = scene.frames / scene.fps if time is None else time
@@ -207,7 +207,7 @@ def run_static(
     *,
     time: float | None = None,
     device: str | None = None,
-    dtype: FloatName = "float32",
+    dtype: FloatName = "float64",
 ) -> StaticSummary:
     """Solves a scene's static equilibrium and stores it in the USD file ``path``, which is overwritten if it exists.
 
@@ -219,7 +219,7 @@ def run_static(
         solver: the settings.
         time: when prescribed motions are held [s]; ``None`` for the time of the last frame.
         device: Warp device, for example "cpu" or "cuda:0"; ``None`` takes Warp's default.
-        dtype: "float32" or "float64".
+        dtype: "float64", or "float32", whose rounding can hide what is left of the forces.
 
     Raises:
         SceneError, OutputError, SimulationError: as :class:`StaticRun` and :func:`record_static`.

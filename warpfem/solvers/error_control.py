@@ -104,7 +104,11 @@ def controlled_step(
                 return ControlledStep(report, dt, wanted, rejected)
         rejected += 1
         if not wanted > LEAST_PART * longest:
-            why = f"can be solved: {failure}" if failure else "meets the error target: take a larger one"
+            why = (
+                f"can be solved: {failure}"
+                if failure
+                else "meets the error target: take a larger one, or a smaller tolerance"
+            )
             if failure is None and report.rounded:
                 why += f", or a higher precision, since steps are {report.note}"
             raise SimulationError(f"t = {state.time:.6g} s: no step of more than {wanted:.3g} s {why}") from failure

@@ -26,6 +26,9 @@ LINEAR_ITERATIONS = 20_000
 """Limit of conjugate gradients for one linear solve: without inertia, nearly incompressible or slender bodies take
 thousands, and each solve that is cut short begins anew."""
 
+NOTABLE_RESIDUAL = 1e-3
+"""Relative residual above which an equilibrium that the rounding of float32 ends is warned of."""
+
 MOST_BEND = 0.21
 """How far supports may stray from the straight within an increment, relative to their way: a turn by 90 degrees."""
 
@@ -263,12 +266,19 @@ class _StaticNewton(Newton):
         self.potential.pose(state.u, weight=0.0, duration=1.0)
         self.curved = False
         report = self.minimise(self._start_after_supports(), state.time)
+        finer = report.rounded and self.model.dtype == "float32"
         if not report.converged:
             raise SimulationError(
                 f"no static equilibrium found: {report.note}, with a residual of {report.residual:.1e}; "
-                f"{worst_cell(self.model, self.u)}. Start nearer to it, or with smaller loads"
+                f"{worst_cell(self.model, self.u)}. "
+                + ('Take dtype="float64"' if finer else "Start nearer to it, or with smaller loads")
             )
         _require_sound(self.model, self.u)
+        if finer and report.residual > NOTABLE_RESIDUAL:
+            warnings.warn(
+                f'float32 resolves the equilibrium only to a residual of {report.residual:.1e}: take dtype="float64"',
+                stacklevel=2,
+            )
         return report
 
     def accept(self, state: State, time: float) -> None:
