@@ -6,7 +6,7 @@ from stepping import slab
 
 from warpfem.boundary import BoxWalls, Pin, Plane, PointForce, PrescribedMotion, Sphere, Traction
 from warpfem.errors import SimulationError
-from warpfem.materials import NeoHookean
+from warpfem.materials import LinearElasticity, NeoHookean
 from warpfem.mesh import Mesh
 from warpfem.model import Model
 from warpfem.reactions import reactions
@@ -133,3 +133,25 @@ def test_refuses_friction_and_wrong_accelerations():
     model = Model(Scene([slab(2)], BackwardEuler()), device="cpu")
     with pytest.raises(SimulationError, match=r"acceleration must have shape \(15, 2\), not \(3,\)"):
         reactions(model, model.state(), np.zeros(3))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_linear_elasticity_balances_at_the_rest_shape_and_knows_one_stress(dim):
+    mesh = Mesh.rectangle((4.0, 1.0), (4, 1)) if dim == 2 else Mesh.box((4.0, 1.0, 1.0), (4, 1, 1))
+    load = Traction("right", (200.0, -1e3, 0.0)[:dim])
+    body = Body("beam", mesh, LinearElasticity(E=1e5, nu=0.3), supports=[Pin("left")], loads=[load])
+    model = Model(Scene([body], BackwardEuler()), dtype="float64")
+    state = model.state()
+    StaticEquilibrium(tolerance=1e-10).solve(model, state)
+    assert np.abs(state.displacement).max() > 0.5  # where rest and current places differ much
+    found = reactions(model, state)
+    np.testing.assert_allclose(found.total, 0.0, atol=1e-6)
+    np.testing.assert_allclose(found.moment(), 0.0, atol=1e-5)
+    assert np.abs(found.supports[0].moment()[-1] - (1e3 * 4.0 + 200.0 * 0.5)) < 1e-5
+    stresses = model.stresses(state)
+    np.testing.assert_array_equal(stresses.cauchy, stresses.first_piola_kirchhoff)
+    _, von_mises = model.diagnostics(state)
+    np.testing.assert_allclose(von_mises, stresses.von_mises, rtol=1e-10)
+    faces = mesh.select_faces("right")
+    P = stresses.first_piola_kirchhoff[mesh.face_cells[faces]]
+    np.testing.assert_allclose(model.tractions(state)[faces], P[:, :dim, 0], atol=1e-9)

@@ -574,11 +574,15 @@ class ElementKernels:
 
     @functools.cached_property
     def diagnostics(self) -> wp.Kernel:
-        """Writes J and the von Mises stress sqrt(3/2) |dev tau| / |J| at each quadrature point, |J| at least 1e-6."""
+        """Writes J and the von Mises stress sqrt(3/2) |dev tau| / |J| at each quadrature point, |J| at least 1e-6.
+
+        At small strain it is sqrt(3/2) |dev P|.
+        """
         scalar, vector, matrix, cell_type = self._types
         parameter_vector = self.parameter_vector
         shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
         places = self.shape.quadrature_count
+        small_strain = self.constitutive.small_strain
         solid_stress = self._solid_stress()
 
         @wp.kernel(module="unique", enable_backward=False)
@@ -595,10 +599,12 @@ class ElementKernels:
             plane = displacement_gradient(u, cells[c], shape_gradients(inverse_shape[i], i % places))
             H = embed(plane)
             J = scalar(1.0) + volume_change(H)
-            kirchhoff = solid_stress(plane, parameters[c]) * wp.transpose(deformation_gradient(H))
-            deviator = kirchhoff - (wp.trace(kirchhoff) / scalar(3.0)) * identity_like(H)
+            cauchy = solid_stress(plane, parameters[c])
+            if wp.static(not small_strain):
+                cauchy = cauchy * wp.transpose(deformation_gradient(H)) / wp.max(wp.abs(J), scalar(1.0e-6))
+            deviator = cauchy - (wp.trace(cauchy) / scalar(3.0)) * identity_like(H)
             jacobian_out[i] = J
-            von_mises_out[i] = wp.sqrt(scalar(1.5) * wp.ddot(deviator, deviator)) / wp.max(wp.abs(J), scalar(1.0e-6))
+            von_mises_out[i] = wp.sqrt(scalar(1.5) * wp.ddot(deviator, deviator))
 
         return element_diagnostics
 

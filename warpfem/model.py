@@ -113,8 +113,9 @@ class Stresses:
         cells: the cell of each quadrature point, (k,).
         points: rest places of the quadrature points, (k, dim) [m].
         volumes: their parts of the rest volume, (k,) [m^3].
-        kirchhoff: tau = P F^T.
-        cauchy: sigma = tau / J, force per current area.
+        small_strain: whether the material is linear elasticity, which knows one stress alone, (k,) bool.
+        kirchhoff: tau = P F^T; P at small strain.
+        cauchy: sigma = tau / J, force per current area; P at small strain.
         jacobian: J = det F, (k,).
         von_mises: sqrt(3/2) |dev sigma|, (k,) [Pa].
     """
@@ -124,6 +125,7 @@ class Stresses:
     cells: np.ndarray
     points: np.ndarray
     volumes: np.ndarray
+    small_strain: np.ndarray
 
     @cached_property
     def jacobian(self) -> np.ndarray:
@@ -131,11 +133,12 @@ class Stresses:
 
     @cached_property
     def kirchhoff(self) -> np.ndarray:
-        return self.first_piola_kirchhoff @ self.deformation_gradient.transpose(0, 2, 1)
+        tau = self.first_piola_kirchhoff @ self.deformation_gradient.transpose(0, 2, 1)
+        return np.where(self.small_strain[:, None, None], self.first_piola_kirchhoff, tau)
 
     @cached_property
     def cauchy(self) -> np.ndarray:
-        return self.kirchhoff / self.jacobian[:, None, None]
+        return self.kirchhoff / np.where(self.small_strain, 1.0, self.jacobian)[:, None, None]
 
     @cached_property
     def von_mises(self) -> np.ndarray:
@@ -533,6 +536,7 @@ class Model:
         count = int(starts[-1])
         P, F = np.empty((count, 3, 3)), np.tile(np.eye(3), (count, 1, 1))
         points, volumes = np.empty((count, self.dim)), np.empty(count)
+        small_strain = np.empty(count, dtype=bool)
         u, rest = state.displacement, self.rest_points
         for block in self.blocks:
             own = (starts[block.index][:, None] + np.arange(block.shape.quadrature_count)).ravel()
@@ -540,6 +544,7 @@ class Model:
             out = wp.zeros(len(volume), dtype=solid, device=self.device)
             block.launch("stress", [state.u], [out])
             P[own], volumes[own] = out.numpy(), volume.numpy()
+            small_strain[own] = block.kernels.constitutive.small_strain
             corners = u[block.host_cells]
             B = block.per_cell(block.arguments["inverse_shape"].numpy().astype(np.float64))
             gradients = np.einsum("qak,cqkj->cqaj", block.shape.quadrature_gradients, B)
@@ -547,7 +552,7 @@ class Model:
             F[own, : self.dim, : self.dim] += H.reshape(-1, self.dim, self.dim)
             values = block.shape.values(block.shape.quadrature_places)
             points[own] = np.einsum("qa,cai->cqi", values, rest[block.host_cells]).reshape(-1, self.dim)
-        return Stresses(F, P, np.repeat(np.arange(self.cell_count), places), points, volumes)
+        return Stresses(F, P, np.repeat(np.arange(self.cell_count), places), points, volumes, small_strain)
 
     def nodal_stresses(self, state: State) -> np.ndarray:
         """Cauchy stresses at the points, recovered from those in the cells about them (see ``recovery.py``).
@@ -600,6 +605,8 @@ class Model:
         normals[:, : self.dim] = mesh.boundary_face_normals
         F = at_faces(stresses.deformation_gradient)
         nominal = np.einsum("fij,fj->fi", at_faces(stresses.first_piola_kirchhoff), normals)  # per rest area
+        if self.scene.bodies[body].material.constitutive.small_strain:
+            return nominal[:, : self.dim]
         inverse_transpose = np.linalg.inv(F).transpose(0, 2, 1)
         area_ratio = np.linalg.det(F) * np.linalg.norm(np.einsum("fij,fj->fi", inverse_transpose, normals), axis=1)
         return (nominal / area_ratio[:, None])[:, : self.dim]

@@ -22,7 +22,7 @@ class PointForces:
     Attributes:
         name: what exerts them.
         points: numbers of the points in the model, (k,) int.
-        places: where the points are, (k, dim) float64 [m].
+        places: where the points are, (k, dim) float64 [m]; those of linear elasticity, where they are at rest.
         forces: the force on each point, (k, dim) float64 [N] (2D: per metre of thickness, as all here).
     """
 
@@ -53,9 +53,7 @@ class PointForces:
 
 @dataclass(frozen=True, eq=False)
 class Reactions:
-    """All forces on the bodies of a state from outside. In equilibrium they sum to zero.
-
-    So do their moments, but those of :class:`LinearElasticity`, which mistakes rotations for strain.
+    """All forces on the bodies of a state from outside. In equilibrium they and their moments sum to zero.
 
     Attributes:
         supports: those of each support, in the order of the bodies and their supports. What two pins hold together
@@ -89,9 +87,9 @@ def reactions(model: Model, state: State, acceleration: np.ndarray | None = None
     """The forces that supports and obstacles exert in a state.
 
     Without accelerations they are those of a static equilibrium, in which quadratic cells share gravity by shape
-    functions; for a state that time steps have brought to rest give accelerations of zero. After a step of :class:`BackwardEuler` that was
-    taken whole, ``(state.velocity - velocity_before) / dt`` gives those of that step; other schemes put their forces
-    and their velocities at different times.
+    functions; for a state that time steps have brought to rest give accelerations of zero. After a step of
+    :class:`BackwardEuler` that was taken whole, ``(state.velocity - velocity_before) / dt`` gives those of that step;
+    other schemes put their forces and their velocities at different times.
 
     Args:
         model: the model.
@@ -116,6 +114,9 @@ def reactions(model: Model, state: State, acceleration: np.ndarray | None = None
     loads = model.static_load if acceleration is None else model.dead_load
     load = np.zeros(shape) if loads is None else loads.numpy().astype(np.float64)
     places = model.rest_points + state.displacement
+    for body, (points, _) in zip(model.scene.bodies, model.body_slices, strict=True):
+        if body.material.constitutive.small_strain:  # whose balance is that of the rest shape
+            places[points] = model.rest_points[points]
     obstacles = _obstacle_forces(model, state, places)
     unbalanced = model.internal_force(state) + load + inertia
     for part in obstacles:

@@ -227,7 +227,8 @@ class Scene:
             if names.count(name) > 1:
                 raise SceneError(f"{names.count(name)} bodies are named '{name}': give each its own name")
         if isinstance(self.solver, type) or not callable(getattr(self.solver, "stepper", None)):
-            raise SceneError(f"solver must be a warpfem solver, for example BackwardEuler(), not {self.solver!r}")
+            hint = "; StaticEquilibrium takes no steps: see `warpfem static`" if hasattr(self.solver, "solve") else ""
+            raise SceneError(f"solver must be a warpfem solver, for example BackwardEuler(), not {self.solver!r}{hint}")
         self._check_number("fps", self.fps, positive=True)
         self._check_number("damping", self.damping)
         if not isinstance(self.dt, str) or self.dt != "auto":

@@ -26,6 +26,7 @@ class Constitutive:
         parameter_count: length of the vector of parameters.
         isotropic: whether psi depends on the principal stretches of F alone.
         convex: whether d²psi/dF² is positive semi-definite for every F.
+        small_strain: whether the theory is that of small strain, which knows one stress and one shape: P is sigma.
         corotated: whether P holds the rotation of F, whose derivative has no bound where the sum of two singular
             values nears 0.
         barrier: whether psi is infinite for J <= 0, so that a step may not lead there.
@@ -41,6 +42,7 @@ class Constitutive:
     parameter_count: int = 2
     isotropic: bool = True
     convex: bool = False
+    small_strain: bool = False
     corotated: bool = False
     barrier: bool = False
     differentiable: bool = True

@@ -31,8 +31,12 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
     volume = np.concatenate([body.mesh.cell_volumes for body in model.scene.bodies])
     for block, part, stiffness in model.element_stiffness_parts(u):
         cells = block.index[part]
-        mass = np.outer(density[cells] * volume[cells], np.repeat(block.shape.mass_shares, model.dim))
-        A = stiffness.reshape(*mass.shape, -1) / np.sqrt(mass[:, :, None] * mass[:, None, :])
+        roots = np.sqrt(np.repeat(block.shape.mass_shares, model.dim))
+        A = stiffness.reshape(len(cells), len(roots), -1) / (density[cells] * volume[cells])[:, None, None]
+        if block.shape.order == 1:
+            A *= roots[0] ** -2
+        else:
+            A /= np.outer(roots, roots)
         scale = np.linalg.norm(A, axis=(1, 2))
         A = A / np.where(scale > 0.0, scale, 1.0)[:, None, None]
         squarings = 2 if block.shape.order == 1 else 4
