@@ -64,6 +64,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
     cell_type = wp.types.vector(length=dim + 1, dtype=wp.int32)
     parameter_vector = wp.types.vector(length=4, dtype=scalar)
+    module = f"warpfem.patches_{measure.value.key}_{dim}_{dtype}"  # one, which compiles faster than one for each
 
     @wp.func
     def displacement_gradient(u: wp.array(dtype=vector), cell: cell_type, B: matrix):
@@ -73,7 +74,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
         return H
 
     def strain_kernel(enable_backward: bool) -> wp.Kernel:
-        @wp.kernel(module="unique", enable_backward=enable_backward)
+        @wp.kernel(module="unique" if enable_backward else module, enable_backward=enable_backward)
         def patch_strain(
             cells: wp.array(dtype=cell_type),
             inverse_shape: wp.array(dtype=matrix),
@@ -97,7 +98,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
         return patch_strain
 
     def pressure_kernel(enable_backward: bool) -> wp.Kernel:
-        @wp.kernel(module="unique", enable_backward=enable_backward)
+        @wp.kernel(module="unique" if enable_backward else module, enable_backward=enable_backward)
         def cell_pressure(
             patch: wp.array(dtype=wp.int32),
             strain: wp.array(dtype=scalar),
@@ -111,7 +112,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
 
         return cell_pressure
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def patch_energy(
         inverse_modulus: wp.array(dtype=scalar),
         strain: wp.array(dtype=scalar),
@@ -125,7 +126,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
             energy = wp.float64(wp.inf)
         wp.atomic_add(energy_out, 0, energy)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def cell_density(
         patch: wp.array(dtype=wp.int32),
         parameters: wp.array(dtype=parameter_vector),
@@ -140,7 +141,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
             density = scalar(wp.inf)
         density_out[i] += density
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def coupling_rows(
         cells: wp.array(dtype=cell_type),
         inverse_shape: wp.array(dtype=matrix),
@@ -168,7 +169,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
                 rows_out[places[c, corner + 1]] += part
             rows_out[places[c, 0]] -= total
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def coupling_rate(
         inverse_modulus: wp.array(dtype=scalar),
         row_starts: wp.array(dtype=wp.int32),
@@ -184,7 +185,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
             total += wp.dot(rows[entry], p[points[entry]])
         rate_out[g] = inverse_modulus[g] * total
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def coupling_product(
         inverse_modulus: wp.array(dtype=scalar),
         column_starts: wp.array(dtype=wp.int32),
@@ -205,7 +206,7 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
             total += (rate[g] - (scalar(1.0) - own) * inverse_modulus[g] * wp.dot(row, p[i])) * row
         product_out[i] += total
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def coupling_diagonal(
         inverse_modulus: wp.array(dtype=scalar),
         row_starts: wp.array(dtype=wp.int32),
