@@ -314,3 +314,18 @@ def relative_error(actual: np.ndarray, expected: np.ndarray, scale: float | np.n
     difference = np.sqrt(np.sum((actual - expected) ** 2, axis=axes))
     size = np.maximum(np.sqrt(np.sum(expected**2, axis=axes)), scale)
     return float(np.max(difference / size))
+
+
+def assert_routes_agree(model: Model, state: State, p: np.ndarray, rounding: float) -> None:
+    """The force differential along p is the difference of forces, and the same to rounding by all routes."""
+    forces = []
+    for sign in (1, -1):
+        moved = model.state()
+        moved.assign(displacement=state.displacement + sign * 1e-6 * p)
+        forces.append(model.internal_force(moved))
+    expected = (forces[0] - forces[1]) / 2e-6
+    scale = np.abs(expected).max()
+    closed = model.force_differential(state, p, "closed")
+    np.testing.assert_allclose(closed, expected, atol=1e-7 * scale)
+    for route in ("tape", "assembled"):
+        np.testing.assert_allclose(model.force_differential(state, p, route), closed, atol=rounding * scale)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -17,6 +17,7 @@ from warpfem.dtypes import FloatName, types, uniform_array
 from warpfem.elements import ElementKernels, element_kernels
 from warpfem.errors import SceneError, SimulationError
 from warpfem.materials import Constitutive, HookeanMaterial
+from warpfem.mesh import Mesh
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
@@ -668,23 +669,26 @@ def _require_resolved(scene: Scene, epsilon: float, dtype: str) -> None:
 
 def _lumped_mass(scene: Scene) -> np.ndarray:
     """Each cell's mass shared among its points."""
-    masses = []
-    for body in scene.bodies:
-        mesh = body.mesh
-        shares = np.outer(body.density * mesh.cell_volumes, mesh.shape.mass_shares)
-        masses.append(np.bincount(mesh.cells.ravel(), shares.ravel(), mesh.point_count))
-    return np.concatenate(masses)
+    return _shared_mass(scene, lambda mesh: mesh.shape.mass_shares)
 
 
 def _integrated_mass(scene: Scene) -> np.ndarray:
     """The integral of density times the shape function of each point; at the corners of quadratic cells it is <= 0."""
+
+    def shares(mesh: Mesh) -> np.ndarray:
+        volumes = mesh.quadrature_volumes.reshape(mesh.cell_count, -1) / mesh.cell_volumes[:, None]
+        return volumes @ mesh.shape.values(mesh.shape.quadrature_places)
+
+    return _shared_mass(scene, shares)
+
+
+def _shared_mass(scene: Scene, shares: Callable[[Mesh], np.ndarray]) -> np.ndarray:
+    """The mass of each point [kg], from its shares in the cells, (k,) for all cells or (cell_count, k)."""
     masses = []
     for body in scene.bodies:
         mesh = body.mesh
-        volumes = mesh.quadrature_volumes.reshape(mesh.cell_count, -1)
-        shares = volumes @ mesh.shape.values(mesh.shape.quadrature_places)
-        shares *= np.broadcast_to(body.density, mesh.cell_count)[:, None]
-        masses.append(np.bincount(mesh.cells.ravel(), shares.ravel(), mesh.point_count))
+        parts = (body.density * mesh.cell_volumes)[:, None] * shares(mesh)
+        masses.append(np.bincount(mesh.cells.ravel(), parts.ravel(), mesh.point_count))
     return np.concatenate(masses)
 
 
