@@ -9,14 +9,26 @@ PACKAGE = Path(__file__).parent.parent / "warpfem"
 
 LAYERS = [
     {"errors", "shapes"},
-    {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child", "recovery"},
+    {
+        "files",
+        "tensor",
+        "dtypes",
+        "boundary",
+        "moduli",
+        "profiling",
+        "child",
+        "recovery",
+        "threads",
+        "strips",
+        "subnormals",
+    },
     {"mesh", "points"},
     {"materials"},
     {"elements", "meshing", "folds", "patches", "patch_kernels"},
     {"scene"},
     {"supports", "contact"},
     {"model"},
-    {"averaged"},
+    {"averaged", "vectorized"},
     {"linear", "reactions"},
     {"solvers"},
     {"simulation"},
@@ -30,7 +42,7 @@ LAYERS = [
 """From the bottom up; a module imports only from the layers below its own."""
 
 # Imported inside a function, where the lower module hands work to an optional upper one.
-UPWARD = {("model", "averaged"), ("model", "linear"), ("meshing", "usd")}
+UPWARD = {("model", "averaged"), ("model", "vectorized"), ("model", "linear"), ("meshing", "usd")}
 
 
 def level(module: str) -> int:
