@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parent.parent / "warpfem"
 LAYERS = [
     {"errors", "shapes"},
     {"files", "tensor", "dtypes", "boundary", "moduli", "profiling", "child", "recovery"},
-    {"mesh", "points"},
+    {"mesh", "points", "stiffness"},
     {"materials"},
     {"elements", "meshing", "folds", "patches", "patch_kernels"},
     {"scene"},

@@ -204,7 +204,7 @@ TERMS = {
     "pin": (
         dict(supports=[Pin("left")]),
         {"supports.hold"},
-        {"supports.hold", "supports.project", "supports.hold_rows"},
+        {"supports.hold", "supports.project"},
     ),
     "contact": (dict(obstacles=[FLOOR]), NORMAL, NORMAL | BLOCKS),
     "friction": (
