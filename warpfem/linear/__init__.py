@@ -8,13 +8,17 @@ from warpfem.linear.conjugate_gradients import (
     Preconditioner,
 )
 from warpfem.linear.operators import AssembledOperator, Hessian, TangentOperator, tangent_operator
+from warpfem.linear.solver import METHODS, LinearMethod, LinearSolver
 
 __all__ = [
+    "METHODS",
     "AssembledOperator",
     "BlockJacobi",
     "ConjugateGradients",
     "Hessian",
+    "LinearMethod",
     "LinearResult",
+    "LinearSolver",
     "LinearStatus",
     "Preconditioner",
     "TangentOperator",

@@ -10,10 +10,10 @@ import warp as wp
 
 from warpfem.errors import SceneError, SimulationError
 from warpfem.folds import folds
-from warpfem.linear import LinearStatus
+from warpfem.linear import METHODS, LinearMethod, LinearStatus
 from warpfem.model import Model, State
 from warpfem.solvers.base import StepReport, require_count, require_tolerance, worst_cell
-from warpfem.solvers.newton import Newton, NewtonSettings
+from warpfem.solvers.newton import Newton, NewtonSettings, require_choice
 from warpfem.solvers.rigid_modes import free_rigid_modes
 
 LEAST_INCREMENT = 2.0**-8
@@ -79,16 +79,19 @@ class StaticEquilibrium:
         max_iterations: Newton iterations of one solve.
         load_steps: increments to apply at least; 1 tries to do without. Descent finds an equilibrium beyond a
             snap-through too, where increments stop with a message.
+        linear_solver: as of ``NewtonSettings``.
     """
 
     tolerance: float = 1e-5
     max_iterations: int = 200
     load_steps: int = 1
+    linear_solver: LinearMethod = "auto"
 
     def __post_init__(self) -> None:
         require_tolerance(self, "tolerance")
         require_count(self, "max_iterations", 2)
         require_count(self, "load_steps", 1)
+        require_choice(self, "linear_solver", METHODS)
 
     def solve(self, model: Model, state: State, time: float | None = None) -> StepReport:
         """Moves ``state`` to an equilibrium, at rest.
@@ -137,9 +140,7 @@ class StaticEquilibrium:
         end = state.time if time is None else time
         straight = model.supports is None or model.supports.bend(end, 0.0, 1.0) <= MOST_BEND
         if self.load_steps == 1 and straight:
-            newton = _StaticNewton(
-                model, NewtonSettings(self.tolerance, self.max_iterations, linear_iterations=LINEAR_ITERATIONS)
-            )
+            newton = _StaticNewton(model, self._newton(self.max_iterations), static=True)
             if model.supports is not None:
                 model.supports.advance(end, 0.0)
             try:
@@ -154,6 +155,11 @@ class StaticEquilibrium:
                 return
         yield from self._climb(model, state, end)
 
+    def _newton(self, iterations: int) -> NewtonSettings:
+        return NewtonSettings(
+            self.tolerance, iterations, linear_solver=self.linear_solver, linear_iterations=LINEAR_ITERATIONS
+        )
+
     def _climb(self, model: Model, state: State, end: float) -> Iterator[LoadIncrement]:
         """Applies loads and motions in increments, from the rest shape."""
         loaded = model
@@ -162,7 +168,7 @@ class StaticEquilibrium:
             loaded.dead_load = wp.clone(model.dead_load)
             full = model.dead_load.numpy().copy()
         iterations = min(self.max_iterations, INCREMENT_ITERATIONS)
-        newton = _StaticNewton(loaded, NewtonSettings(self.tolerance, iterations, linear_iterations=LINEAR_ITERATIONS))
+        newton = _StaticNewton(loaded, self._newton(iterations), static=True)
         state.u.zero_()
         state.v.zero_()
         longest = 1.0 / self.load_steps
@@ -305,7 +311,7 @@ class _StaticNewton(Newton):
         potential.linearize(self.u, "exact")
         if super()._solve(1e-4).status is not LinearStatus.CURVATURE:
             return True
-        p, product = self.cg.direction
+        p, product = self.linear.direction
         blocks = np.linalg.inv(potential.operator.inverse_diagonal.numpy().astype(np.float64))
         size = np.einsum("pi,pij,pj->", p, blocks, p)
         return float(np.sum(p * product)) >= -4.0 * model.types.epsilon * size
