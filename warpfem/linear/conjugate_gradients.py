@@ -54,9 +54,11 @@ class Preconditioner(ABC):
 
     Attributes:
         on_device: whether :meth:`apply` launches kernels alone, so that a graph can hold it.
+        version: changes when the arrays do that :meth:`apply` takes.
     """
 
     on_device = True
+    version = 0
 
     @abstractmethod
     def apply(self, r: wp.array, z_out: wp.array) -> None:
@@ -65,6 +67,14 @@ class Preconditioner(ABC):
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
         return []
+
+
+class RenewedPreconditioner(Preconditioner):
+    """One that is costly to set up, and so kept for tangents after the one that it was made for."""
+
+    @abstractmethod
+    def update(self) -> bool:
+        """Makes it that of the present tangent; returns whether that is positive definite, and it of use."""
 
 
 class BlockJacobi(Preconditioner):
@@ -211,12 +221,13 @@ class ConjugateGradients:
         if not (operator.fixed and preconditioner.on_device):
             self._launch_iteration(operator, preconditioner, x)
             return
-        parties = operator, preconditioner, x
-        if self._graph is None or any(a is not b for a, b in zip(self._graph[0], parties, strict=True)):
+        parties = operator, preconditioner, x  # held by the graph, so that no other gets their ids
+        key = (*map(id, parties), preconditioner.version)
+        if self._graph is None or self._graph[0] != key:
             with wp.ScopedCapture(device=self.model.device) as capture:
                 self._launch_iteration(operator, preconditioner, x)
-            self._graph = parties, capture.graph
-        wp.capture_launch(self._graph[1])
+            self._graph = key, parties, capture.graph
+        wp.capture_launch(self._graph[2])
 
     def _scalar(self, index: int) -> float:
         values = self._scalars.numpy() if self._view is None else self._view

@@ -19,14 +19,14 @@ import numpy as np
 import warp as wp
 
 from warpfem.errors import SimulationError
-from warpfem.linear.conjugate_gradients import Preconditioner
+from warpfem.linear.conjugate_gradients import RenewedPreconditioner
 from warpfem.linear.operators import AssembledOperator
 
 _SYMMETRIC_INDEFINITE = -2
 _ANALYSE, _FACTORISE, _SOLVE, _RELEASE = 11, 22, 33, -1
 
 
-class SparseFactor(Preconditioner):
+class SparseFactor(RenewedPreconditioner):
     """The inverse of A as it was when :meth:`update` was called last."""
 
     on_device = False

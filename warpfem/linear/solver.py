@@ -13,6 +13,7 @@ from warpfem.linear.conjugate_gradients import (
     LinearResult,
     LinearStatus,
     Preconditioner,
+    RenewedPreconditioner,
 )
 from warpfem.linear.operators import AssembledOperator, TangentOperator
 from warpfem.model import Model
@@ -108,6 +109,16 @@ def _poisson_ratio(model: Model) -> float:
     return max(float(max(ratio)) if hasattr(ratio, "__len__") else float(ratio) for ratio in ratios)
 
 
+def _strong(method: str, operator: AssembledOperator) -> RenewedPreconditioner:
+    if method == "cholesky":
+        from warpfem.linear.factor import SparseFactor
+
+        return SparseFactor(operator)
+    from warpfem.linear.multigrid import Multigrid
+
+    return Multigrid(operator)
+
+
 class LinearSolver:
     """Solves A x = b for the tangents of one operator.
 
@@ -126,7 +137,7 @@ class LinearSolver:
         self.method = self.choice.first
         self._cg = ConjugateGradients(operator.model)
         self._jacobi = BlockJacobi(operator)
-        self._strong: Preconditioner | None = None
+        self._strong: RenewedPreconditioner | None = None
         self._aged = False
 
     def arrays(self) -> list[wp.array]:
@@ -190,9 +201,7 @@ class LinearSolver:
     def _renew(self) -> bool:
         """Makes the factor or hierarchy that of the present tangent; returns whether that is positive definite."""
         if self._strong is None:
-            from warpfem.linear.factor import SparseFactor
-
-            self._strong = SparseFactor(self.operator)
+            self._strong = _strong(self.method, self.operator)
         self._aged = not self._strong.update()
         return not self._aged
 
