@@ -196,7 +196,7 @@ def launched(monkeypatch, solver, supports=(), loads=(), **settings):
 
 
 NORMAL = {"contact_plane.contact_force", "contact_plane.contact_energy"}
-BLOCKS = {"contact_plane.contact_blocks", "operators.add_blocks"}
+BLOCKS = {"contact_plane.contact_blocks"}
 TERMS = {
     "gravity": (dict(gravity=(0.0, -9.8)), set(), {"implicit.free_flight"}),
     "load": (dict(loads=[PointForce("right", (1.0, 0.0))]), set(), {"implicit.free_flight"}),

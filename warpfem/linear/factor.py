@@ -36,9 +36,9 @@ class SparseFactor(RenewedPreconditioner):
         self._matrix = _UpperTriangle(operator)
         self._pardiso = _Pardiso(self._matrix.row_starts, self._matrix.columns)
 
-    def update(self) -> bool:
-        """Factors A as it is now; returns whether it is positive definite, and so of use."""
-        return self._pardiso.factorise(self._matrix.values()) == self._matrix.patch_count
+    def update(self, shift: float = 0.0) -> bool:
+        """Factors A + shift D as it is now, D the diagonal blocks; returns whether that is positive definite."""
+        return self._pardiso.factorise(self._matrix.values(shift)) == self._matrix.patch_count
 
     def apply(self, r: wp.array, z_out: wp.array) -> None:
         model = self._operator.model
@@ -96,15 +96,20 @@ class _UpperTriangle:
         self.columns = column[order].astype(np.int32)
         self.row_starts = np.searchsorted(row[order], np.arange(self.size + 1)).astype(np.int32)
 
-    def values(self) -> np.ndarray:
-        """The entries of the operator's present tangent, float64."""
-        parts = [self._operator.assembly.blocks.numpy().ravel()]
+    def values(self, shift: float) -> np.ndarray:
+        """The entries of the operator's present tangent plus ``shift`` times its diagonal blocks, float64."""
+        operator = self._operator
+        entries = operator.assembly.blocks.numpy()
+        if shift:
+            entries = entries.astype(np.float64)
+            entries[operator.assembly.pattern.diagonal] *= 1.0 + shift
+        entries = entries.ravel()
         if self.patch_count:
-            found = [block.coupling_rows() for block in self._operator.averaged]
-            parts.append(np.concatenate([rows.ravel() for _, _, rows, _ in found]) * self._free[self._coupled_rows])
-            parts.append(-1.0 / np.concatenate([inverse for *_, inverse in found]).astype(np.float64))
-            return np.concatenate(parts)[self._source]
-        return parts[0][self._source].astype(np.float64)
+            found = [block.coupling_rows() for block in operator.averaged]
+            rows = np.concatenate([own.ravel() for _, _, own, _ in found]) * self._free[self._coupled_rows]
+            moduli = 1.0 / np.concatenate([inverse for *_, inverse in found]).astype(np.float64)
+            entries = np.concatenate([entries, rows, -moduli])
+        return entries[self._source].astype(np.float64)
 
 
 def _ranges(starts: np.ndarray, ends: np.ndarray) -> np.ndarray:

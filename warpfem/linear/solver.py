@@ -125,12 +125,18 @@ class LinearSolver:
     A factor or a hierarchy is that of an earlier tangent, with which conjugate gradients solve for the present one,
     until it takes them more than ``PATIENCE`` iterations.
 
+    Args:
+        operator: A.
+        method: what is asked for.
+        static: whether inertia is absent.
+        watchful: whether negative curvature that the right-hand side feels must not go unnoticed.
+
     Attributes:
         choice: the method to begin with, and why.
         method: the method now.
     """
 
-    def __init__(self, operator: TangentOperator, method: LinearMethod, static: bool) -> None:
+    def __init__(self, operator: TangentOperator, method: LinearMethod, static: bool, watchful: bool = False) -> None:
         self.operator = operator
         assembled = isinstance(operator, AssembledOperator)
         self.choice = choose(operator.model, method, assembled, static)
@@ -139,6 +145,7 @@ class LinearSolver:
         self._jacobi = BlockJacobi(operator)
         self._strong: RenewedPreconditioner | None = None
         self._aged = False
+        self._watchful = watchful
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
@@ -152,6 +159,15 @@ class LinearSolver:
     def __str__(self) -> str:
         words = {"conjugate_gradients": "conjugate gradients with block Jacobi", "cholesky": "sparse Cholesky"}
         return f"{words.get(self.method, self.method)} ({self.choice.reason})"
+
+    def definite(self, shift: float) -> bool | None:
+        """Whether A + shift D is positive definite, D its diagonal blocks; ``None`` where no factor tells."""
+        if self.method != "cholesky":
+            return None
+        if self._strong is None:
+            self._strong = _strong(self.method, self.operator)
+        self._aged = not self._strong.update(shift)
+        return not self._aged
 
     def solve(self, b: wp.array, x: wp.array, *, tolerance: float, max_iterations: int) -> LinearResult:
         """Solves A x = b from x = 0 until |b - A x| <= tolerance |b|; overwrites ``x``.
@@ -179,7 +195,7 @@ class LinearSolver:
 
         ``before`` counts iterations done, from whose end this one starts.
         """
-        fresh = self._strong is None or self._aged
+        fresh = self._strong is None or self._aged or (self._watchful and self.method == "cholesky")
         if fresh and not self._renew():
             return self._without_factor(b, x, tolerance, max_iterations, before)
         patience = PATIENCE[self.method]
@@ -208,6 +224,11 @@ class LinearSolver:
     def _without_factor(
         self, b: wp.array, x: wp.array, tolerance: float, max_iterations: int, before: int
     ) -> LinearResult:
-        """A descent direction for a matrix that is not positive definite."""
-        result = self._iterate(self._jacobi, b, x, tolerance, min(CURVED, max_iterations))
-        return LinearResult(before + result.iterations, result.residual, LinearStatus.CURVATURE)
+        """A descent direction for a matrix that is not positive definite.
+
+        Where it matters whether this right-hand side feels that, conjugate gradients tell.
+        """
+        limit = max_iterations if self._watchful else min(CURVED, max_iterations)
+        result = self._iterate(self._jacobi, b, x, tolerance, limit)
+        status = result.status if self._watchful else LinearStatus.CURVATURE
+        return LinearResult(before + result.iterations, result.residual, status)

@@ -91,6 +91,7 @@ class Newton:
         model: the model.
         settings: how.
         static: whether without inertia.
+        watchful: whether negative curvature that the forces feel must not go unnoticed.
 
     Attributes:
         linear: what solves the linear systems.
@@ -99,11 +100,11 @@ class Newton:
         d: the increment that led there, u - u_b without its rounding, device array [m].
     """
 
-    def __init__(self, model: Model, settings: NewtonSettings, *, static: bool = False) -> None:
+    def __init__(self, model: Model, settings: NewtonSettings, *, static: bool = False, watchful: bool = False) -> None:
         self.model = model
         self.settings = settings
         self.potential = IncrementalPotential(model, settings.differential)
-        self.linear = LinearSolver(self.potential.operator, settings.linear_solver, static)
+        self.linear = LinearSolver(self.potential.operator, settings.linear_solver, static, watchful)
         self.u, self._trial, self.d, self._trial_d, self._direction = (model.zeros() for _ in range(5))
 
     def arrays(self) -> list[wp.array]:

@@ -35,6 +35,9 @@ MOST_BEND = 0.21
 JUMP = 2.0
 """Displacement per load, relative to that of the increment before, from which negative curvature means a jump."""
 
+LARGE_JUMP = 4.0
+"""The same where no negative curvature was met: Newton's method can step across it."""
+
 
 _UNSTABLE = (
     ". The stiffness has directions of negative curvature there: the path of equilibria turns unstable (snap-through "
@@ -56,11 +59,13 @@ class LoadIncrement:
         fraction: part of the loads and of the prescribed motions that acts, 1 at the end.
         report: how it was found.
         stable: whether its stiffness was found free of negative curvature; asked only at the end.
+        linear_solver: what solved the linear systems, and why.
     """
 
     fraction: float
     report: StepReport
     stable: bool = True
+    linear_solver: str = ""
 
 
 @dataclass(frozen=True)
@@ -151,7 +156,7 @@ class StaticEquilibrium:
                 del newton  # and its arrays
             else:
                 newton.accept(state, end)
-                yield LoadIncrement(1.0, report)
+                yield LoadIncrement(1.0, report, linear_solver=str(newton.linear))
                 return
         yield from self._climb(model, state, end)
 
@@ -168,7 +173,7 @@ class StaticEquilibrium:
             loaded.dead_load = wp.clone(model.dead_load)
             full = model.dead_load.numpy().copy()
         iterations = min(self.max_iterations, INCREMENT_ITERATIONS)
-        newton = _StaticNewton(loaded, self._newton(iterations), static=True)
+        newton = _StaticNewton(loaded, self._newton(iterations), static=True, watchful=True)
         state.u.zero_()
         state.v.zero_()
         longest = 1.0 / self.load_steps
@@ -189,7 +194,8 @@ class StaticEquilibrium:
             try:
                 report = newton.solve(state)
                 next_rate = newton.distance() / (goal - fraction)
-                if newton.curved and (rate is None or next_rate > JUMP * rate or not newton.stable()):
+                newton.curved |= rate is not None and next_rate > LARGE_JUMP * rate
+                if newton.curved and (rate is None or next_rate > JUMP * rate):
                     raise SimulationError("the bodies jump from one equilibrium to another")
             except SimulationError as error:
                 length = 0.5 * (goal - fraction)
@@ -206,7 +212,7 @@ class StaticEquilibrium:
             stable = goal < 1.0 or newton.stable()
             if not stable:
                 warnings.warn(_SADDLE, stacklevel=2)
-            yield LoadIncrement(goal, report, stable)
+            yield LoadIncrement(goal, report, stable, str(newton.linear))
 
 
 def at_rest(model: Model) -> Model:
@@ -299,16 +305,20 @@ class _StaticNewton(Newton):
         return self.model.dot(self.d, self.d) ** 0.5
 
     def stable(self) -> bool:
-        """Whether conjugate gradients for a random force meet no negative curvature of the stiffness, but rounding.
+        """Whether the stiffness has no direction of negative curvature, but by rounding.
 
-        The residual of a direction of negative curvature never falls, so that they cannot pass it by.
+        The signs of a factor tell. Without one, conjugate gradients for a random force do: the residual of such a
+        direction never falls, so that they cannot pass it by.
         """
         model, potential = self.model, self.potential
+        potential.linearize(self.u, "exact")
+        definite = self.linear.definite(4.0 * model.types.epsilon)
+        if definite is not None:
+            return definite
         random = np.random.default_rng(0).standard_normal((model.point_count, model.dim))
         potential.force.assign(random.astype(model.types.numpy))
         if model.supports is not None:
             model.supports.project(potential.force)
-        potential.linearize(self.u, "exact")
         if super()._solve(1e-4).status is not LinearStatus.CURVATURE:
             return True
         p, product = self.linear.direction
