@@ -10,7 +10,6 @@ from unittest.mock import patch
 
 import warp as wp
 
-
 GRAPH = ("iteration of conjugate gradients (a graph of the kernels)", "warpfem.graph")
 """Name and module by which a graph of kernels is counted: no other is captured."""
 

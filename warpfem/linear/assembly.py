@@ -168,6 +168,7 @@ def _assemble_kernel(dim: int, dtype: str) -> wp.Kernel:
                 total += block
             j = columns[slot]
             if j == i:
+                total = scalar(0.5) * (total + wp.transpose(total))
                 total += (mass_weight * mass[i]) * wp.identity(n=dim, dtype=scalar)
                 if extra.shape[0] > 0:
                     total += extra[i]

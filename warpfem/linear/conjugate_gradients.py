@@ -268,17 +268,13 @@ def _kernels(dim: int, dtype: str) -> SimpleNamespace:
         return result
 
     @wp.kernel(module=module, enable_backward=False)
-    def multiply_blocks(
-        blocks: wp.array(dtype=matrix), p: wp.array(dtype=vector), product_out: wp.array(dtype=vector)
-    ):
+    def multiply_blocks(blocks: wp.array(dtype=matrix), p: wp.array(dtype=vector), product_out: wp.array(dtype=vector)):
         """Writes the product of a block per point with p."""
         i = wp.tid()
         product_out[i] = blocks[i] * p[i]
 
     @wp.kernel(module=module, enable_backward=False)
-    def curvature(
-        p: wp.array(dtype=vector), q: wp.array(dtype=vector), parts_out: wp.array2d(dtype=wp.float64)
-    ):
+    def curvature(p: wp.array(dtype=vector), q: wp.array(dtype=vector), parts_out: wp.array2d(dtype=wp.float64)):
         """Parts of p . A p."""
         chunk = wp.tid()
         result = wp.float64(0.0)

@@ -161,8 +161,7 @@ class _Pardiso:
         integers = np.array([1, _SYMMETRIC_INDEFINITE, phase, len(self._row_starts) - 1, 0, 0], dtype=np.int32)
         one, kind, step, size, silent, error = (integers[k:].ctypes.data for k in range(6))
         values, row_starts, columns, handle, options = (
-            array.ctypes.data
-            for array in (self._values, self._row_starts, self._columns, self._handle, self._options)
+            array.ctypes.data for array in (self._values, self._row_starts, self._columns, self._handle, self._options)
         )
         b, x = (None if array is None else array.ctypes.data for array in (right, solution))
         self._function(

@@ -352,9 +352,7 @@ def _level_kernels(block: int) -> SimpleNamespace:
         x_out[i] += d[i]
 
     @wp.kernel(module=module, enable_backward=False)
-    def multiply_dense(
-        inverse: wp.array2d(dtype=matrix), b: wp.array(dtype=vector), x_out: wp.array(dtype=vector)
-    ):
+    def multiply_dense(inverse: wp.array2d(dtype=matrix), b: wp.array(dtype=vector), x_out: wp.array(dtype=vector)):
         """Writes the product of a dense matrix of blocks with b."""
         i = wp.tid()
         total = vector()

@@ -21,6 +21,7 @@ from warpfem.tensor import is_positive_definite
 
 Hessian: TypeAlias = Literal["exact", Filter]
 
+
 @functools.cache
 def operator_kernels(dim: int, dtype: str) -> SimpleNamespace:
     """The kernels that put operators together and apply them."""

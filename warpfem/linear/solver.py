@@ -160,6 +160,11 @@ class LinearSolver:
         words = {"conjugate_gradients": "conjugate gradients with block Jacobi", "cholesky": "sparse Cholesky"}
         return f"{words.get(self.method, self.method)} ({self.choice.reason})"
 
+    def forget(self) -> None:
+        """Solves as if for the first time, so that a run that is taken up again has the same bits."""
+        self.method = self.choice.first
+        self._aged = True
+
     def definite(self, shift: float) -> bool | None:
         """Whether A + shift D is positive definite, D its diagonal blocks; ``None`` where no factor tells."""
         if self.method != "cholesky":

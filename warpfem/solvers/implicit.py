@@ -181,6 +181,7 @@ class ImplicitStepper(Stepper):
         """
         model, newton, tableau = self.model, self.newton, self.config.tableau
         report: StepReport | None = None
+        newton.linear.forget()
         if model.contact is not None:
             model.contact.limit_friction(state.u)
         for index, row in enumerate(tableau.rows):
