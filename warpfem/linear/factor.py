@@ -23,6 +23,7 @@ from warpfem.linear.conjugate_gradients import RenewedPreconditioner
 from warpfem.linear.operators import AssembledOperator
 
 _SYMMETRIC_INDEFINITE = -2
+_REPRODUCIBLE = 2
 _ANALYSE, _FACTORISE, _SOLVE, _RELEASE = 11, 22, 33, -1
 
 
@@ -177,9 +178,14 @@ class _Pardiso:
 
 @functools.cache
 def _pardiso():
-    """The function of the library."""
+    """The function of the library, which gives the same bits whatever the number of threads.
+
+    That is oneMKL's conditional numerical reproducibility, which has to be asked for before anything else.
+    """
     from pypardiso import PyPardisoSolver
 
-    function = PyPardisoSolver().libmkl.pardiso
+    library = PyPardisoSolver().libmkl
+    library.MKL_CBWR_Set(_REPRODUCIBLE)
+    function = library.pardiso
     function.argtypes = [ctypes.c_void_p] * 16
     return function
