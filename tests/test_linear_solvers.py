@@ -249,3 +249,40 @@ def test_equilibria_do_not_depend_on_the_method(element):
         assert "as asked for" in last.linear_solver
         found.append(state.displacement)
     np.testing.assert_allclose(found[0], found[1], atol=1e-7 * np.abs(found[0]).max())
+
+
+def test_a_step_does_not_depend_on_the_factors_before_it():
+    """So that a run that is taken up again has the same bits."""
+    pytest.importorskip("pypardiso")
+    solver = BackwardEuler(linear_solver="cholesky")
+    body = Body("strip", Mesh.rectangle((4.0, 1.0), (16, 4)), StableNeoHookean(1e5, 0.3), supports=[Pin("left")])
+    model = Model(Scene([body], solver, gravity=(0.0, -9.8)), device="cpu")
+    used, state = solver.stepper(model), model.state()
+    for _ in range(3):
+        used.step(state, 0.1)
+    other = state.copy()
+    used.step(state, 0.1)
+    solver.stepper(model).step(other, 0.1)
+    np.testing.assert_array_equal(state.displacement, other.displacement)
+
+
+def test_a_factor_has_the_same_bits_whatever_the_number_of_threads():
+    pypardiso = pytest.importorskip("pypardiso")
+    operator = tangent(strip(cells=(60, 30)))
+    library = pypardiso.PyPardisoSolver().libmkl
+    found = []
+    for threads in (1, 2):
+        library.MKL_Set_Num_Threads(threads)
+        x, _ = solved(LinearSolver(operator, "cholesky", static=True))
+        found.append(x)
+    library.MKL_Set_Num_Threads(max(2, library.MKL_Get_Max_Threads()))
+    np.testing.assert_array_equal(*found)
+
+
+def test_what_was_chosen_is_told():
+    from warpfem.explain import explain
+
+    body = Body("strip", Mesh.rectangle((4.0, 1.0), (16, 4)), StableNeoHookean(1e5, 0.3), supports=[Pin("left")])
+    told = str(explain(Scene([body], BackwardEuler(), gravity=(0.0, -9.8), frames=2), device="cpu"))
+    assert "linear systems: conjugate gradients with block Jacobi (" in told
+    assert "iteration of conjugate gradients (a graph of the kernels)" in told
