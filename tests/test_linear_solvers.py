@@ -270,12 +270,12 @@ def test_a_factor_has_the_same_bits_whatever_the_number_of_threads():
     pypardiso = pytest.importorskip("pypardiso")
     operator = tangent(strip(cells=(60, 30)))
     library = pypardiso.PyPardisoSolver().libmkl
-    found = []
+    found, before = [], library.MKL_Get_Max_Threads()
     for threads in (1, 2):
         library.MKL_Set_Num_Threads(threads)
         x, _ = solved(LinearSolver(operator, "cholesky", static=True))
         found.append(x)
-    library.MKL_Set_Num_Threads(max(2, library.MKL_Get_Max_Threads()))
+    library.MKL_Set_Num_Threads(before)
     np.testing.assert_array_equal(*found)
 
 
