@@ -141,9 +141,16 @@ def test_the_assembled_matrix_is_symmetric_to_the_last_bit():
 def test_the_choice_follows_size_inertia_and_incompressibility(monkeypatch, static, nu, most, first, then):
     monkeypatch.setattr(choice, "find_spec", lambda name: True)
     monkeypatch.setitem(choice.MOST_FACTORED, 2, most)
+    monkeypatch.setattr(choice, "SMALL", 0)
     chosen = choice.choose(strip(nu=nu), "auto", assembled=True, static=static)
     assert (chosen.first, chosen.then) == (first, then)
     assert "350 unknowns in 2D" in chosen.reason
+
+
+def test_small_equilibria_load_no_library_unless_they_are_hard(monkeypatch):
+    monkeypatch.setattr(choice, "find_spec", lambda name: True)
+    chosen = choice.choose(strip(), "auto", assembled=True, static=True)
+    assert (chosen.first, chosen.then) == ("conjugate_gradients", "cholesky")
 
 
 def test_without_the_packages_conjugate_gradients_are_left(monkeypatch):

@@ -28,6 +28,9 @@ MOST_FACTORED = {2: 1_000_000, 3: 120_000}
 MOST_FACTORED_LOCKED = {2: 1_000_000, 3: 400_000}
 """The same for nearly incompressible bodies, with which multigrid needs many times the iterations."""
 
+SMALL = 3000
+"""Unknowns up to which an equilibrium may be found before the library of the factor is loaded (0.3 to 0.6 s)."""
+
 LOCKED = 0.45
 """Poisson's ratio from which bodies count as nearly incompressible."""
 
@@ -86,7 +89,7 @@ def choose(model: Model, method: LinearMethod, assembled: bool, static: bool) ->
             "conjugate_gradients", None, f"{then} would suit {size}, but {_PACKAGES[then]} is not installed: {_INSTALL}"
         )
     bound = f"{'at most' if unknowns <= most else 'more than'} {most}"
-    if static:
+    if static and unknowns > SMALL:
         return LinearChoice(then, None, f"no inertia, and {size}, {bound}")
     return LinearChoice(
         "conjugate_gradients",
