@@ -119,7 +119,7 @@ class Newton:
         if self.model.supports is not None:
             self.model.supports.project(potential.force)
         potential.linearize(self.u, "exact")
-        self.linear.solve(potential.force, self._direction, tolerance=0.5, max_iterations=1)
+        self.linear.solve(potential.force, self._direction, tolerance=1e-12, max_iterations=2)
         potential.rounding(self.d, self.u)
 
     # --- where to start ---------------------------------------------------------------------------------
