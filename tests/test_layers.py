@@ -22,7 +22,7 @@ LAYERS = [
         "strips",
         "subnormals",
     },
-    {"mesh", "points"},
+    {"mesh", "points", "stiffness"},
     {"materials"},
     {"elements", "meshing", "folds", "patches", "patch_kernels"},
     {"scene"},
@@ -88,4 +88,4 @@ def test_optional_packages_are_imported_where_they_are_used(path):
     top = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
     names = {alias.name.split(".")[0] for node in top if isinstance(node, ast.Import) for alias in node.names}
     names |= {(node.module or "").split(".")[0] for node in top if isinstance(node, ast.ImportFrom)}
-    assert not names & {"meshio", "pytetwild", "matplotlib", "PIL", "tqdm", "trimesh"}
+    assert not names & {"meshio", "pytetwild", "matplotlib", "PIL", "tqdm", "trimesh", "scipy", "pyamg", "pypardiso"}

@@ -21,6 +21,7 @@ from warpfem.mesh import Mesh
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
+from warpfem.stiffness import pair_count, pair_index
 from warpfem.threads import available_threads
 
 if TYPE_CHECKING:
@@ -243,12 +244,13 @@ class CellBlock:
     ) -> None:
         """Launches the kernel of that name over the quadrature points of the cells, or of a part of them.
 
-        Of :attr:`arguments` it gets first those that it names. The kernel ``frequency`` runs over cells.
+        Of :attr:`arguments` it gets first those that it names. Those of frequency and stiffness run over cells.
         """
         kernel = getattr(kernels or self.kernels, name)
         arrays = self.arguments if part is None else self._arguments_of(part)
         own = [arrays[argument.label] for argument in kernel.adj.args if argument.label in arrays]
-        tasks = len(arrays["cells"]) if name == "frequency" else len(arrays["volume"])
+        by_cell = name == "frequency" or name.endswith("stiffness")
+        tasks = len(arrays["cells"]) if by_cell else len(arrays["volume"])
         wp.launch(kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device)
 
     def _arguments_of(self, part: slice) -> dict[str, wp.array]:
@@ -566,11 +568,12 @@ class Model:
             for start in range(0, block.count, most):
                 part = slice(start, min(start + most, block.count))
                 count = part.stop - start
-                slots = np.arange(count * corners**2, dtype=np.int32).reshape(count, corners, corners)
-                values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
-                slot_array = wp.array(slots, dtype=wp.int32, device=self.device)
-                block.launch("stiffness", [u, slot_array], [values], part=part, kernels=block.bounding_kernels)
-                entries = values.numpy().astype(np.float64).reshape(count, corners, corners, d, d)
+                pairs = pair_index(corners)
+                values = wp.empty(count * pair_count(corners), dtype=self.types.matrix, device=self.device)
+                block.launch("stiffness", [u], [values], part=part, kernels=block.bounding_kernels)
+                entries = values.numpy().astype(np.float64).reshape(count, -1, d, d)[:, pairs]
+                lower = np.tril_indices(corners, -1)
+                entries[:, lower[0], lower[1]] = entries[:, lower[0], lower[1]].swapaxes(-2, -1)
                 yield block, part, entries.transpose(0, 1, 3, 2, 4)
 
     def stresses(self, state: State) -> Stresses:
