@@ -293,7 +293,8 @@ for GPUs on a machine without one, and times are predicted, so that a measuremen
 
 Every kernel that the shipped scenes launch up to their first frame, in float32 (a custom energy computes in float64),
 compiled by Warp {wp.config.version} for compute capabilities {" and ".join(f"{a / 10}" for a in ARCHITECTURES)};
-{assembler}. "Warps of 64" is how many the registers leave room for on a multiprocessor, in blocks of 256 threads.
+{assembler}. "Warps of 64" is how many the registers leave room for on a multiprocessor,
+in blocks of 256 threads.
 
 | kernel | first used by | {architectures} |
 |---|---|{"---|" * (4 * len(ARCHITECTURES))}
@@ -312,8 +313,8 @@ A block of tetrahedra, stable Neo-Hookean, above a floor, float32, by the kernel
 {sources}
 
 What the model leaves out makes a measurement slower: conflicts of the atomic additions at shared points, latency where
-few warps fit, gaps between launches. **The prediction is refuted by a time below {EFFICIENCY:.0%} of it or above twice
-of it**, once the host keeps up.
+few warps fit, gaps between launches; a cache that holds much of what 1M cells need makes it faster. **At 10M cells, the
+prediction is refuted by a time below {EFFICIENCY:.0%} of it or above twice of it**, once the host keeps up.
 
 ### One explicit step
 
