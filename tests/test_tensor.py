@@ -71,10 +71,12 @@ def kernels(dim: int, dtype: str) -> SimpleNamespace:
         log1p_out[i] = tensor.log1p(y[i])
         deficit_out[i] = tensor.log1p_deficit(y[i])
 
+    rotation = tensor.differentiable_rotation()
+
     @wp.kernel(module=module)
     def differentiable_rotation(F: wp.array(dtype=matrix), R_out: wp.array(dtype=matrix)):
         i = wp.tid()
-        R_out[i] = tensor.rotation(F[i])
+        R_out[i] = rotation(F[i])
 
     return SimpleNamespace(**{name: value for name, value in locals().items() if isinstance(value, wp.Kernel)})
 

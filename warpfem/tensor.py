@@ -4,6 +4,7 @@ H is the displacement gradient, F = I + H the deformation gradient, J = det F. T
 cancellation that the textbook forms in F suffer near rest (Shakeri, Brown et al. 2024).
 """
 
+import functools
 from typing import Any
 
 import warp as wp
@@ -446,13 +447,21 @@ def rotation_differential(F: mat33, G: mat33):  # noqa: F811
     return R * skew(_rotation_rate(R, F, G))
 
 
-for _matrix in (wp.mat22f, wp.mat22d, wp.mat33f, wp.mat33d):
+@functools.cache
+def differentiable_rotation() -> wp.Function:
+    """:func:`polar_rotation` with the exact derivative for Warp's reverse mode.
 
-    @wp.func
-    def rotation(F: _matrix):
-        """:func:`polar_rotation` with the exact derivative for Warp's reverse mode."""
-        return polar_rotation(F)
+    Made when first asked for: to attach a derivative, Warp analyses all that the function calls, which takes as long
+    as to import the rest of this package.
+    """
+    for matrix in (wp.mat22f, wp.mat22d, wp.mat33f, wp.mat33d):
 
-    @wp.func_grad(rotation)
-    def _adjoint_rotation(F: _matrix, adjoint: _matrix):
-        wp.adjoint[F] += rotation_differential(F, adjoint)  # dR/dF is symmetric
+        @wp.func
+        def rotation(F: matrix):
+            return polar_rotation(F)
+
+        @wp.func_grad(rotation)
+        def adjoint_rotation(F: matrix, adjoint: matrix):
+            wp.adjoint[F] += rotation_differential(F, adjoint)  # dR/dF is symmetric
+
+    return rotation

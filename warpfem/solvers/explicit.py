@@ -124,6 +124,7 @@ class _ExplicitStepper(Stepper):
         self._kernel = _kick_drift_kernel(model.dim, model.dtype)
         self._force = model.zeros()
         self._rough = model.contact is not None and model.contact.rough
+        self._rest_frequency: float | None = None
         self._limit: float | None = None
         self._watch: Watch | None = None
         self._watched_speed = 0.0
@@ -140,8 +141,10 @@ class _ExplicitStepper(Stepper):
         return [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]
 
     def stable_dt(self, state: State | None = None) -> float:
-        frequency = largest_frequency(self.model)
-        if state is not None:
+        if self._rest_frequency is None:
+            self._rest_frequency = largest_frequency(self.model)
+        frequency = self._rest_frequency
+        if state is not None and state.u.numpy().any():
             frequency = np.maximum(frequency, largest_frequency(self.model, state.u))  # not a number stays
         if state is not None and not np.isfinite(frequency):
             raise SimulationError(
