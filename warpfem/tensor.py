@@ -159,18 +159,48 @@ def log1p(y: Any):
 def volume_ratio(H: Any):
     """J = det(I + H): from J - 1 near rest, from F under compression, where J - 1 would keep no digits of J."""
     j = volume_change(H)
-    if j < H.dtype(-0.5):
-        return wp.determinant(deformation_gradient(H))
-    return H.dtype(1.0) + j
+    return wp.where(j < H.dtype(-0.5), wp.determinant(deformation_gradient(H)), H.dtype(1.0) + j)
+
+
+@wp.func
+def _binary_exponent(x: wp.float32):
+    """The power e of 2 that brings x > 0 to [sqrt(1/2), sqrt(2)], and 2^-e."""
+    e = (wp.cast(x, wp.int32) - 0x3F3504F3) >> 23
+    return wp.float32(e), wp.cast((127 - e) << 23, wp.float32)
+
+
+@wp.func
+def _binary_exponent(x: wp.float64):  # noqa: F811
+    e = (wp.cast(x, wp.int64) - wp.int64(0x3FE6A09E667F3BCD)) >> wp.int64(52)
+    return wp.float64(e), wp.cast((wp.int64(1023) - e) << wp.int64(52), wp.float64)
 
 
 @wp.func
 def log_volume_ratio(H: Any):
-    """ln J, accurate near rest and under compression; not a number for J < 0."""
+    """ln J, accurate near rest and under compression; not a number for J <= 0.
+
+    With J = 2^e (1 + y), ln J = e ln 2 + 2 atanh z, z = y / (2 + y), |z| < 0.18: without branches or calls, so that the
+    compiler can take several at a time.
+    """
+    one = H.dtype(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
     j = volume_change(H)
-    if j < H.dtype(-0.5):
-        return wp.log(wp.determinant(deformation_gradient(H)))
-    return log1p(j)
+    J = volume_ratio(H)
+    e, scale = _binary_exponent(J)
+    near = wp.abs(j) < H.dtype(0.3)
+    y = wp.where(near, j, J * scale - one)
+    z = y / (H.dtype(2.0) + y)
+    w = z * z
+    series = one / H.dtype(19.0)
+    series = series * w + one / H.dtype(17.0)
+    series = series * w + one / H.dtype(15.0)
+    series = series * w + one / H.dtype(13.0)
+    series = series * w + one / H.dtype(11.0)
+    series = series * w + one / H.dtype(9.0)
+    series = series * w + one / H.dtype(7.0)
+    series = series * w + one / H.dtype(5.0)
+    series = series * w + one / H.dtype(3.0)
+    value = wp.where(near, H.dtype(0.0), e) * H.dtype(0.6931471805599453) + H.dtype(2.0) * z * (one + w * series)
+    return wp.where(J > H.dtype(0.0), value, H.dtype(wp.nan))
 
 
 @wp.func
