@@ -170,7 +170,7 @@ def _binary_exponent(x: wp.float32):
 
 
 @wp.func
-def _binary_exponent(x: wp.float64):  # noqa: F811
+def _binary_exponent(x: wp.float64):
     e = (wp.cast(x, wp.int64) - wp.int64(0x3FE6A09E667F3BCD)) >> wp.int64(52)
     return wp.float64(e), wp.cast((wp.int64(1023) - e) << wp.int64(52), wp.float64)
 
