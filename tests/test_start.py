@@ -27,6 +27,7 @@ SCENES = {
             "element_energy",
             "element_force",
             "element_stiffness",
+            "warpfem.assembly_3_float32",
             "warpfem.conjugate_gradients_3_float32",
             "warpfem.implicit_3_float32",
             "warpfem.operators_3_float32",
