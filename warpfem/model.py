@@ -566,13 +566,14 @@ class Model:
         d = self.dim
         corners = block.shape.point_count
         most = STIFFNESS_PART * (d + 1) ** 2 // corners**2
+        pairs = pair_index(corners)
         lower = np.tril_indices(corners, -1)
         for start in range(0, block.count, most):
             part = slice(start, min(start + most, block.count))
             count = part.stop - start
             values = wp.empty(count * pair_count(corners), dtype=self.types.matrix, device=self.device)
             block.launch("stiffness", [u], [values], part=part, kernels=block.bounding_kernels)
-            entries = values.numpy().astype(np.float64).reshape(count, -1, d, d)[:, pair_index(corners)]
+            entries = values.numpy().astype(np.float64).reshape(count, -1, d, d)[:, pairs]
             entries[:, lower[0], lower[1]] = entries[:, lower[0], lower[1]].swapaxes(-2, -1)
             yield part, entries.transpose(0, 1, 3, 2, 4)
 
