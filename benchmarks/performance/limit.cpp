@@ -556,6 +556,7 @@ void strips(const Mesh& mesh, const Run& run) {
     auto forces = [&](int t) {
         Four* f = force[t].data();
         for (const auto& block : blocks[t]) {
+            for (size_t o = 0; o < sizeof(block); o += 64) _mm_prefetch((const char*)(&block + 2) + o, _MM_HINT_T0);
             typename Lanes<N>::Float part[K + 3][3];
             block_forces<Material>(block, u.data(), part);
             for (int i = 0; i < K + 3; i++) {
