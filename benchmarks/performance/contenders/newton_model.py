@@ -17,4 +17,6 @@ def build(problem, k_mu, k_lambda, gravity=0.0, coloured=False):
         builder.add_tetrahedron(i, j, k, m, k_mu=k_mu, k_lambda=k_lambda, k_damp=0.0)
     if coloured:
         builder.color()
-    return builder.finalize(device="cpu")
+    model = builder.finalize(device="cpu")
+    model.particle_grid = None  # no contact between particles
+    return model
