@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from performance import machine, peers, problems
 from performance.turns import Contender, Outcome, ratio, take_turns
 
@@ -57,7 +58,7 @@ def run(quick: bool, peers_folder: Path, threads: tuple[int, ...]) -> dict[str, 
         steps = max(5, min(500, 10_000_000 // cells))
         who = contenders(material, count, steps, binary, plain=side > 30)
         print(f"  {cells} cells, {material}, threads: {count}")
-        outcomes = take_turns(who, problem, 3 if quick else 15, peers_folder, budget=45.0)
+        outcomes = take_turns(who, problem, 3 if quick else 15, peers_folder, budget=25.0)
         groups.append(_group(cells, material, count, outcomes))
     triad = peers.compiled("triad.cpp", peers_folder)
     bandwidth = [

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from performance import problems
 from performance.turns import Contender, Outcome, ratio, take_turns
 

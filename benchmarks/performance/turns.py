@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from performance.peers import interpreter
 
 CONTENDERS = Path(__file__).with_name("contenders")
@@ -104,7 +105,7 @@ class _Process:
             "OMP_WAIT_POLICY": "passive",  # who has had a turn must not spin in the next one's
             "PYTHONPATH": os.pathsep.join([str(CONTENDERS), str(CONTENDERS.parents[2])]),
         }
-        self._errors = tempfile.TemporaryFile()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         self._process = subprocess.Popen(
             [python, CONTENDERS / contender.script, problem, json.dumps(contender.options)],
             stdin=subprocess.PIPE,

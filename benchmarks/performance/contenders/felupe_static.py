@@ -1,4 +1,4 @@
-"""The static equilibrium of a Neo-Hookean beam under its weight with FElupe: Newton's method and its usual sparse LU."""
+"""The static equilibrium of a Neo-Hookean beam under its weight with FElupe: Newton's method, its usual sparse LU."""
 
 import felupe
 import numpy as np
@@ -25,7 +25,8 @@ def setup(problem, options):
         last["newton"] = found.iterations
 
     return Contender(
-        lambda: {"seconds": timed(solve), "newton": last["newton"]}, lambda: {"displacement": np.array(last["displacement"])}
+        lambda: {"seconds": timed(solve), "newton": last["newton"]},
+        lambda: {"displacement": np.array(last["displacement"])},
     )
 
 

@@ -1,9 +1,9 @@
 """Steps of symplectic Euler with Taichi, in four ways.
 
-    atomic   a kernel over cells adds corner forces to points
-    serial   the same, told to be serial, which spares the atomics: one thread only
-    sums     corner forces are written, and summed by a kernel over points
-    tape     the energy is written and its tape gives the forces
+atomic   a kernel over cells adds corner forces to points
+serial   the same, told to be serial, which spares the atomics: one thread only
+sums     corner forces are written, and summed by a kernel over points
+tape     the energy is written and its tape gives the forces
 """
 
 import numpy as np
@@ -12,7 +12,9 @@ from serving import Contender, serve, timed
 
 
 def setup(problem, options):
-    ti.init(arch=ti.cpu, cpu_max_num_threads=options["threads"], default_fp=ti.f32, offline_cache=False, log_level="error")
+    ti.init(
+        arch=ti.cpu, cpu_max_num_threads=options["threads"], default_fp=ti.f32, offline_cache=False, log_level="error"
+    )
     points, cells = problem["points"], problem["cells"]
     point_count, cell_count = len(points), len(cells)
     E, nu, density = (float(problem[name]) for name in ("E", "nu", "density"))

@@ -186,7 +186,10 @@ def setup(problem, options):
         applied = masses[:, None] * velocity
         np.add.at(applied, cells[:, 1:], parts)
         np.add.at(applied, cells[:, 0], -parts.sum(axis=1))
-        return {"residual": np.atleast_1d(np.linalg.norm(right - applied) / np.linalg.norm(right)), "velocity": velocity}
+        return {
+            "residual": np.atleast_1d(np.linalg.norm(right - applied) / np.linalg.norm(right)),
+            "velocity": velocity,
+        }
 
     return Contender(run, outcome)
 

@@ -7,6 +7,7 @@ import numpy as np
 from serving import Contender, serve
 
 import warpfem as wf
+from warpfem.model import device_bytes
 from warpfem.simulation import Simulation
 
 
@@ -46,7 +47,8 @@ def setup(problem, options):
         last["displacement"] = state.u.numpy().astype(np.float64)
         return {"seconds": seconds / (steps - 1)}
 
-    return Contender(run, lambda: {"forces": forces, **last})
+    held = device_bytes([*model.arrays(), *stepper.arrays(), simulation.state.u, simulation.state.v])
+    return Contender(run, lambda: {"forces": forces, **last}, {"device_bytes": held})
 
 
 serve(setup)
