@@ -167,19 +167,23 @@ def take_turns(
                 if i in processes:
                     processes.pop(i).close()
             print(f"    {contender.name}: {outcomes[i].missing or 'ready'}", file=sys.stderr)
-        start = time.monotonic()
-        for repeat in range(repeats):
-            if repeat >= 3 and time.monotonic() - start > budget:
-                break
-            for i in list(processes):
-                try:
-                    outcomes[i].turns.append(processes[i].ask("turn"))
-                except RuntimeError as error:
-                    outcomes[i].missing = str(error)
-                    processes.pop(i).close()
+        _go_round(processes, outcomes, repeats, budget)
         for i, process in processes.items():
             arrays = Path(folder, f"{i}.npz")
             process.ask(f"save {arrays}")
             outcomes[i].arrays = dict(np.load(arrays))
             process.close()
     return outcomes
+
+
+def _go_round(processes: dict[int, _Process], outcomes: list[Outcome], repeats: int, budget: float) -> None:
+    start = time.monotonic()
+    for repeat in range(repeats):
+        if repeat >= 3 and time.monotonic() - start > budget:
+            break
+        for i in list(processes):
+            try:
+                outcomes[i].turns.append(processes[i].ask("turn"))
+            except RuntimeError as error:
+                outcomes[i].missing = str(error)
+                processes.pop(i).close()

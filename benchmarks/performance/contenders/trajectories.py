@@ -28,10 +28,9 @@ def follow(settings, prepare, problem):
                 start = time.perf_counter()
                 found = advance(interval)
                 seconds += time.perf_counter() - start
-                difference = np.linalg.norm(found - expected, axis=1).max() / peak
-                error = max(error, difference) if np.isfinite(difference) else np.inf
-                if not error < 10.0:
-                    error = 1e9  # what JSON has for infinite
+                error = max(error, np.linalg.norm(found - expected, axis=1).max() / peak)
+                if not error < 10.0:  # or not a number
+                    error = 1e9  # JSON has no infinity
                     break
             results[name] = {"seconds": seconds, "error": float(error)}
         return {"seconds": sum(r["seconds"] for r in results.values()), "settings": results}

@@ -31,8 +31,11 @@ def setup(problem, options):
             states[:] = [simulation.model.state()]
 
         def advance(duration):
-            for _ in range(steps):
-                simulation.stepper.step(states[0], duration / steps)
+            try:
+                for _ in range(steps):
+                    simulation.stepper.step(states[0], duration / steps)
+            except wf.SimulationError:
+                return np.array(np.nan)
             return states[0].displacement
 
         return reset, advance
