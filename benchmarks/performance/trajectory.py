@@ -24,7 +24,8 @@ DURATION = 0.8
 
 SAMPLES = 16
 
-# steps in each of the intervals between samples (explicit ones need 68 to be stable); for vertex block descent also iterations a step
+# steps in each of the intervals between samples, of which explicit ones need 68 to be stable; for vertex block descent
+# also iterations a step
 OWN_STEPS = {
     "linearised": (40, 80, 120),
     "implicit_midpoint": (2, 4),

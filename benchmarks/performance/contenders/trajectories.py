@@ -28,8 +28,10 @@ def follow(settings, prepare, problem):
                 start = time.perf_counter()
                 found = advance(interval)
                 seconds += time.perf_counter() - start
-                error = max(error, np.linalg.norm(found - expected, axis=1).max() / peak)
-                if not error < 10.0:  # or not a number
+                error = np.maximum(
+                    error, np.linalg.norm(found - expected, axis=1).max() / peak
+                )  # keeps what is not a number
+                if not error < 10.0:
                     error = 1e9  # JSON has no infinity
                     break
             results[name] = {"seconds": seconds, "error": float(error)}
