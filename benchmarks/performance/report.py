@@ -127,7 +127,21 @@ def _explicit(result: Results, folder: Path) -> list[str]:
         ]
         lines += _table(head, rows)
         lines += _explicit_targets(group)
-    return lines + _roofline(result, folder)
+    return lines + _thread_targets(result) + _roofline(result, folder)
+
+
+def _thread_targets(result: Results) -> list[str]:
+    rates = {
+        (group["cells"], group["material"], group["threads"]): own["rate"]
+        for group in result["groups"]
+        if (own := _find(group, "warpfem"))
+    }
+    told = [
+        f"{cells:,} cells, {material}: " + _target("aimed at 1.8", rate / alone, rate / alone >= 1.8)
+        for (cells, material, threads), rate in rates.items()
+        if threads == 2 and cells > 50_000 and (alone := rates.get((cells, material, 1)))
+    ]
+    return ["Two threads over one: " + "; ".join(told) + ".", ""] if told else []
 
 
 def _explicit_targets(group: Results) -> list[str]:
