@@ -18,9 +18,6 @@ STEP_BYTES = 76
 """Least memory traffic of a cell in a step [bytes]: 16 of corners, 36 of D^-1, 12 of volume and parameters, and its
 share of the points, a fifth of 24 + 24 + 12 for u, v and the inverse mass, read and written."""
 
-AGREEMENT = 1e-4
-"""Largest difference of forces between contenders, relative to the largest force."""
-
 
 def contenders(material: str, threads: int, steps: int, binary: str | None, plain: bool) -> list[Contender]:
     """Who takes part; ``plain`` leaves out those that are slow beyond interest on large meshes."""
