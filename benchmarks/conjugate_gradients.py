@@ -14,7 +14,7 @@ import warp as wp
 from warp.optim.linear import LinearOperator, cg
 
 import warpfem as wf
-from warpfem.linear import ConjugateGradients, tangent_operator
+from warpfem.linear import BlockJacobi, ConjugateGradients, tangent_operator
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
     operator = tangent_operator(model, "assembled")
     operator.linearize(model.state().u, mass_weight=1e4, precondition=True)
     b, x = model.dead_load, model.zeros()
-    own = ConjugateGradients(model)
+    own, jacobi = ConjugateGradients(model), BlockJacobi(operator)
 
     def multiply(p, y, z, alpha, beta):  # z = alpha A p + beta y, as warp.optim.linear calls it
         operator.apply(p, z)
@@ -43,7 +43,7 @@ def main() -> None:
     M = LinearOperator(shape, model.types.vector, model.device, precondition)
 
     def solve_own() -> None:
-        own.solve(operator, b, x, tolerance=1e-30, max_iterations=arguments.iterations)
+        own.solve(operator, jacobi, b, x, tolerance=1e-30, max_iterations=arguments.iterations)
 
     def solve_library() -> None:
         x.zero_()

@@ -196,7 +196,7 @@ def launched(monkeypatch, solver, supports=(), loads=(), **settings):
 
 
 NORMAL = {"contact_plane.contact_force", "contact_plane.contact_energy"}
-BLOCKS = {"contact_plane.contact_blocks", "operators.add_blocks"}
+BLOCKS = {"contact_plane.contact_blocks"}
 TERMS = {
     "gravity": (dict(gravity=(0.0, -9.8)), set(), {"implicit.free_flight"}),
     "load": (dict(loads=[PointForce("right", (1.0, 0.0))]), set(), {"implicit.free_flight"}),
@@ -204,7 +204,7 @@ TERMS = {
     "pin": (
         dict(supports=[Pin("left")]),
         {"supports.hold"},
-        {"supports.hold", "supports.project", "supports.hold_rows"},
+        {"supports.hold", "supports.project"},
     ),
     "contact": (dict(obstacles=[FLOOR]), NORMAL, NORMAL | BLOCKS),
     "friction": (

@@ -135,14 +135,24 @@ class AveragedBlock(CellBlock):
             self._arrays["rows"] = wp.empty(len(self._arrays["points"]), dtype=vector, device=self.device)
         self._launch_own("rows", self.patch_count, [u], [self._arrays["rows"]])
 
-    def add_coupling(self, p: wp.array, product_out: wp.array, *, diagonal: bool) -> None:
-        """Adds the product of the coupling with p, with or without its blocks on the diagonal."""
+    def add_coupling(self, p: wp.array, product_out: wp.array) -> None:
+        """Adds the product of the coupling with p."""
         self._launch_own("rate", self.patch_count, [p], [self._arrays["rate"]])
-        self._launch_own("product", self._point_bound, [1.0 if diagonal else 0.0, p], [product_out])
+        self._launch_own("product", self._point_bound, [], [product_out])
 
-    def add_coupling_diagonal(self, diagonal: wp.array, blocks_out: wp.array) -> None:
-        """Adds the coupling's blocks on the diagonal, which are at the places ``diagonal``."""
-        self._launch_own("diagonal", self.patch_count, [diagonal], [blocks_out])
+    def add_coupling_diagonal(self, blocks_out: wp.array) -> None:
+        """Adds the coupling's blocks on the diagonal, one for each point."""
+        self._launch_own("diagonal", self._point_bound, [], [blocks_out])
+
+    def coupling_rows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The coupling at the displacements that were taken last, on the host.
+
+        Returns:
+            The start of each patch's row in the next two, its points, the entries r_g of these, and 1 / L_g.
+        """
+        names = ("row_starts", "points", "rows", "inverse_modulus")
+        starts, points, rows, inverse = (self._arrays[name].numpy() for name in names)
+        return starts, points, rows, inverse
 
     def _launch_own(self, name: str, tasks: int, inputs: list, outputs: list) -> None:
         kernel = getattr(self._kernels, name)

@@ -89,6 +89,12 @@ def _parser() -> argparse.ArgumentParser:
     existing = run.add_mutually_exclusive_group()
     existing.add_argument("--resume", action="store_true", help="go on after the last checkpoint of the same run")
     existing.add_argument("--overwrite", action="store_true", help="replace an output that exists, without asking")
+    run.add_argument(
+        "--threads",
+        type=_positive,
+        metavar="N",
+        help="threads that explicit steps may use on the CPU (default: all cores); the result is the same",
+    )
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     run.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else")
     run.set_defaults(command=_run)
@@ -167,7 +173,7 @@ def _positive(text: str) -> int:
     return number
 
 
-_positive.__name__ = "number of frames"  # argparse's name for what is no number
+_positive.__name__ = "number"  # argparse's name for what is no number
 
 
 def _scene_options(parser: argparse.ArgumentParser, dtype: FloatName = "float32") -> None:
@@ -269,7 +275,7 @@ def _run(arguments: argparse.Namespace) -> int:
     say = not (arguments.quiet or arguments.json)
     if say:
         print(f"{arguments.scene}: preparing (the first run of a scene compiles its kernels)", file=sys.stderr)
-    simulation = Simulation(scene, device=arguments.device, dtype=arguments.dtype)
+    simulation = Simulation(scene, device=arguments.device, dtype=arguments.dtype, threads=arguments.threads)
     summary = simulation.summary
     code = OK
     try:

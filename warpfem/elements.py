@@ -5,9 +5,9 @@ F = I + H (Hu 2020; Sifakis and Barbic 2012). In a linear cell g_k is constant, 
 it is taken at each of the dim + 1 quadrature points, for which rows of B are the gradients of the barycentric
 coordinates.
 
-Kernels run over quadrature points, of which a linear cell has one. They take the cells' data as ``cells, parameters``
-(one entry for each cell) and ``inverse_shape, volume`` (one for each quadrature point) and exist, each in a module of
-its own, only once something asks for them.
+Kernels run over quadrature points, of which a linear cell has one, but for those of stiffness and frequency, which run
+over cells. They take the cells' data as ``cells, parameters`` (one entry for each cell) and ``inverse_shape, volume``
+(one for each quadrature point) and exist, each in a module of its own, only once something asks for them.
 """
 
 import functools
@@ -18,6 +18,7 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.materials.base import Constitutive
 from warpfem.shapes import Shape
+from warpfem.stiffness import exact_stiffness_kernel, filtered_stiffness_kernel
 from warpfem.tensor import (
     cofactor,
     deformation_gradient,
@@ -112,15 +113,9 @@ class ElementKernels:
                 wp.atomic_add(force_out, cell[k + 1], f)
             wp.atomic_add(force_out, cell[0], -total)
 
-        @wp.func
-        def add_block(blocks: wp.array(dtype=matrix), slot: int, block: matrix):
-            if slot >= 0:
-                wp.atomic_add(blocks, slot, block)
-
         self._shape_gradients = shape_gradients
         self._displacement_gradient = displacement_gradient
         self._add_divergence = add_divergence
-        self._add_block = add_block
 
     @functools.cached_property
     def energy(self) -> wp.Kernel:
@@ -255,10 +250,7 @@ class ElementKernels:
 
     @functools.cached_property
     def stiffness(self) -> wp.Kernel:
-        """Adds the d x d blocks K_ab of each cell's tangent stiffness to ``blocks_out[slots[cell, a, b]]``.
-
-        A block whose slot is negative is left out.
-        """
+        """Writes the d x d blocks K_ab of each cell's tangent stiffness to ``entries_out`` (see stiffness.py)."""
         return self._exact_stiffness_kernel()
 
     @functools.cached_property
@@ -272,92 +264,17 @@ class ElementKernels:
         return self._filtered_stiffness_kernel("absolute") if self._filterable else self.stiffness
 
     def _exact_stiffness_kernel(self) -> wp.Kernel:
-        dim = self.dim
-        scalar, vector, matrix, cell_type = self._types
-        parameter_vector = self.parameter_vector
-        add_block = self._add_block
-        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
-        places = self.shape.quadrature_count
-        others = self.shape.point_count - 1
-        stress_differential = self.constitutive.stress_differential
-
-        @wp.kernel(module="unique", enable_backward=False)
-        def element_stiffness(
-            cells: wp.array(dtype=cell_type),
-            inverse_shape: wp.array(dtype=matrix),
-            volume: wp.array(dtype=scalar),
-            parameters: wp.array(dtype=parameter_vector),
-            u: wp.array(dtype=vector),
-            slots: wp.array3d(dtype=wp.int32),
-            blocks_out: wp.array(dtype=matrix),
-        ):
-            i = wp.tid()
-            c = i // places
-            gradients = shape_gradients(inverse_shape[i], i % places)
-            p = parameters[c]
-            H = displacement_gradient(u, cells[c], gradients)
-            components = int(dim)
-            count = int(others)
-            for b in range(count):  # the columns of shape function b + 1, of component k
-                column_sum = matrix()
-                for k in range(components):
-                    axis = vector()
-                    axis[k] = scalar(1.0)
-                    dP = volume[i] * stress_differential(H, wp.outer(axis, gradients[b]), p)
-                    for a in range(count):
-                        block = wp.outer(dP * gradients[a], axis)
-                        column_sum += block
-                        add_block(blocks_out, slots[c, a + 1, b + 1], block)
-                        add_block(blocks_out, slots[c, a + 1, 0], -block)
-                add_block(blocks_out, slots[c, 0, b + 1], -column_sum)
-                add_block(blocks_out, slots[c, 0, 0], column_sum)
-
-        return element_stiffness
+        return exact_stiffness_kernel(
+            self.shape, self.types, self.parameter_vector, self._kinematics, self.constitutive.stress_differential
+        )
 
     def _filtered_stiffness_kernel(self, kind: Filter) -> wp.Kernel:
-        dim = self.dim
-        scalar, vector, matrix, cell_type = self._types
-        parameter_vector = self.parameter_vector
-        add_block = self._add_block
-        shape_gradients, displacement_gradient = self._shape_gradients, self._displacement_gradient
-        places = self.shape.quadrature_count
         tangent, _apply = self._filtered_rule(kind)
-        point_count = self.shape.point_count
-        gradients_type = wp.types.matrix(shape=(point_count, dim), dtype=scalar)
+        return filtered_stiffness_kernel(self.shape, self.types, self.parameter_vector, self._kinematics, tangent)
 
-        @wp.kernel(module="unique", enable_backward=False)
-        def filtered_element_stiffness(
-            cells: wp.array(dtype=cell_type),
-            inverse_shape: wp.array(dtype=matrix),
-            volume: wp.array(dtype=scalar),
-            parameters: wp.array(dtype=parameter_vector),
-            u: wp.array(dtype=vector),
-            slots: wp.array3d(dtype=wp.int32),
-            blocks_out: wp.array(dtype=matrix),
-        ):
-            i = wp.tid()
-            c = i // places
-            rest_gradients = shape_gradients(inverse_shape[i], i % places)
-            t = tangent(displacement_gradient(u, cells[c], rest_gradients), parameters[c])
-            gradients = gradients_type()  # of the shape functions, in the principal axes of C
-            for k in range(wp.static(point_count - 1)):
-                g = rest_gradients[k] * t.V
-                gradients[k + 1] = g
-                gradients[0] = gradients[0] - g
-            count = int(point_count)
-            for a in range(count):
-                g = gradients[a]
-                for b in range(a, count):
-                    h = gradients[b]
-                    # K_ab in the principal axes: entry (m, n) is the sum over j, l of dP_mj/dF_nl g_j h_l
-                    K = wp.cw_mul(t.stretch, wp.outer(g, h)) + wp.cw_mul(t.swapped, wp.outer(h, g))
-                    K += wp.diag(t.same * wp.cw_mul(g, h))
-                    block = volume[i] * (t.U * K * wp.transpose(t.U))
-                    add_block(blocks_out, slots[c, a, b], block)
-                    if b > a:
-                        add_block(blocks_out, slots[c, b, a], wp.transpose(block))
-
-        return filtered_element_stiffness
+    @property
+    def _kinematics(self) -> tuple[wp.Function, wp.Function]:
+        return self._shape_gradients, self._displacement_gradient
 
     @functools.cached_property
     def frequency(self) -> wp.Kernel:

@@ -35,12 +35,13 @@ def folds(mesh: Mesh, points: np.ndarray) -> np.ndarray:
             first, second = _across(first, axis), _across(second, axis)
         hinges.append(np.sort(cells[:, hinge], axis=1))
         angles.append(_angle(first, second))
-    unique, inverse = np.unique(np.concatenate(hinges), axis=0, return_inverse=True)
-    turns = np.bincount(inverse.ravel(), np.concatenate(angles)) / (2.0 * np.pi)
+    rows = np.concatenate(hinges)
+    keys, first_rows, inverse = np.unique(_keys(rows, mesh.point_count), return_index=True, return_inverse=True)
+    turns = np.bincount(inverse, np.concatenate(angles)) / (2.0 * np.pi)
     faces = mesh.linear_boundary_faces
     outer = np.concatenate([np.sort(faces[:, hinge], axis=1) for hinge in combinations(range(mesh.dim), mesh.dim - 1)])
-    inner = ~np.isin(_keys(unique, mesh.point_count), _keys(outer, mesh.point_count))
-    return unique[inner & (turns > 1.5)]
+    inner = ~np.isin(keys, _keys(outer, mesh.point_count))
+    return rows[first_rows[inner & (turns > 1.5)]]
 
 
 def _across(vectors: np.ndarray, axes: np.ndarray) -> np.ndarray:

@@ -21,12 +21,19 @@ from warpfem.mesh import Mesh
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
+from warpfem.stiffness import pair_count, pair_index
+from warpfem.threads import available_threads
 
 if TYPE_CHECKING:
     from warpfem.contact import Contact
     from warpfem.supports import Supports
+    from warpfem.vectorized import VectorizedForce
 
 Route = Literal["tape", "closed", "assembled"]
+
+VECTORIZED_CELLS = 1024
+"""Cells of a material from which on explicit steps compute its forces several cells at a time: that takes some seconds
+to compile once, and work to prepare."""
 
 STIFFNESS_PART = 16384
 """Cells whose dense stiffness is held at a time: 19 MB for tetrahedra, where that of a million takes 1.2 GB."""
@@ -159,6 +166,7 @@ class CellBlock:
         arguments: device arrays ``cells, inverse_shape, volume, parameters`` by name; the second and the third have
             an entry for each quadrature point, cell by cell.
         averaged: whether the cells are coupled beyond their points: then it is an ``AveragedBlock``.
+        vectorized: what computes the internal force several cells at a time, once :meth:`vectorize` has made it.
         bounding_kernels: kernels by which the stiffness of the whole is at most the sum over the cells.
     """
 
@@ -170,6 +178,7 @@ class CellBlock:
         self.kernels = self.bounding_kernels = kernels
         self.shape = kernels.shape
         self.device = device
+        self.vectorized: VectorizedForce | None = None
         self.count = sum(mesh.cell_count for mesh in meshes)
         self.index = np.concatenate([start + np.arange(b.mesh.cell_count) for b, _, start in parts])
         self.host_cells = np.concatenate([start + body.mesh.cells for body, start, _ in parts])
@@ -197,7 +206,32 @@ class CellBlock:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return list(self.arguments.values())
+        own = [] if self.vectorized is None else self.vectorized.arrays()
+        return [*self.arguments.values(), *own]
+
+    def vectorize(self, rest_points: np.ndarray) -> None:
+        """Prepares the force of several cells at a time, where that is possible and pays."""
+        possible = self.device.is_cpu and self.shape.order == 1 and not self.averaged
+        if self.vectorized or not possible or not self.kernels.constitutive.branchless or self.count < VECTORIZED_CELLS:
+            return
+        from warpfem.vectorized import VectorizedForce
+
+        parameters = self.arguments["parameters"]
+        self.vectorized = VectorizedForce(
+            self.kernels,
+            self.host_cells,
+            rest_points,
+            self.arguments["inverse_shape"].numpy(),
+            self.arguments["volume"].numpy(),
+            parameters.numpy()[: 1 if parameters.strides[0] == 0 else None],
+        )
+
+    def add_force(self, u: wp.array, force_out: wp.array) -> None:
+        """Adds the internal forces -dU/du [N] at ``u`` to ``force_out``."""
+        if self.vectorized is None:
+            self.launch("force", [u], [force_out])
+        else:
+            self.vectorized.add(u, force_out)
 
     def launch(
         self,
@@ -210,12 +244,13 @@ class CellBlock:
     ) -> None:
         """Launches the kernel of that name over the quadrature points of the cells, or of a part of them.
 
-        Of :attr:`arguments` it gets first those that it names. The kernel ``frequency`` runs over cells.
+        Of :attr:`arguments` it gets first those that it names. Those of frequency and stiffness run over cells.
         """
         kernel = getattr(kernels or self.kernels, name)
         arrays = self.arguments if part is None else self._arguments_of(part)
         own = [arrays[argument.label] for argument in kernel.adj.args if argument.label in arrays]
-        tasks = len(arrays["cells"]) if name == "frequency" else len(arrays["volume"])
+        by_cell = name == "frequency" or name.endswith("stiffness")
+        tasks = len(arrays["cells"]) if by_cell else len(arrays["volume"])
         wp.launch(kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device)
 
     def _arguments_of(self, part: slice) -> dict[str, wp.array]:
@@ -242,6 +277,7 @@ class Model:
         scene: the scene.
         device: Warp device.
         dtype: "float32" or "float64".
+        threads: threads of the CPU that explicit steps may use; the results do not depend on them.
         types: the Warp types.
         point_count, cell_count: totals over the bodies.
         point_starts, cell_starts: first point and cell of each body, with the total at the end.
@@ -256,11 +292,14 @@ class Model:
         SceneError: if the scene refers to something that does not exist or contradicts itself.
     """
 
-    def __init__(self, scene: Scene, *, device: str | None = None, dtype: FloatName = "float32") -> None:
+    def __init__(
+        self, scene: Scene, *, device: str | None = None, dtype: FloatName = "float32", threads: int | None = None
+    ) -> None:
         if not isinstance(scene, Scene):
             raise SceneError(f"a model is made of a warpfem.Scene, not of {scene!r}")
         self.scene = scene
         self.dtype = dtype
+        self.threads = available_threads() if threads is None else _require_threads(threads)
         self.dim = scene.dim
         self.types = types(scene.dim, str(dtype))
         try:
@@ -451,17 +490,26 @@ class Model:
     def add_internal_force(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the internal forces -dU/du [N] at ``u`` to ``force_out``."""
         for block in self.blocks:
-            block.launch("force", [u], [force_out])
+            block.add_force(u, force_out)
 
     def force(self, u: wp.array, force_out: wp.array) -> None:
         """Overwrites ``force_out`` with all forces but inertia, damping and friction [N]."""
+        self.external_force(u, force_out)
+        self.add_internal_force(u, force_out)
+
+    def external_force(self, u: wp.array, force_out: wp.array) -> None:
+        """Overwrites ``force_out`` with dead loads and the forces of obstacles [N]."""
         if self.dead_load is None:
             force_out.zero_()
         else:
             wp.copy(force_out, self.dead_load)
-        self.add_internal_force(u, force_out)
         if self.contact is not None:
             self.contact.add_force(u, force_out)
+
+    def vectorize(self) -> None:
+        """Prepares the forces of explicit steps: on the CPU, of several cells at a time."""
+        for block in self.blocks:
+            block.vectorize(self.rest_points)
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""
@@ -520,11 +568,12 @@ class Model:
             for start in range(0, block.count, most):
                 part = slice(start, min(start + most, block.count))
                 count = part.stop - start
-                slots = np.arange(count * corners**2, dtype=np.int32).reshape(count, corners, corners)
-                values = wp.zeros(slots.size, dtype=self.types.matrix, device=self.device)
-                slot_array = wp.array(slots, dtype=wp.int32, device=self.device)
-                block.launch("stiffness", [u, slot_array], [values], part=part, kernels=block.bounding_kernels)
-                entries = values.numpy().astype(np.float64).reshape(count, corners, corners, d, d)
+                pairs = pair_index(corners)
+                values = wp.empty(count * pair_count(corners), dtype=self.types.matrix, device=self.device)
+                block.launch("stiffness", [u], [values], part=part, kernels=block.bounding_kernels)
+                entries = values.numpy().astype(np.float64).reshape(count, -1, d, d)[:, pairs]
+                lower = np.tril_indices(corners, -1)
+                entries[:, lower[0], lower[1]] = entries[:, lower[0], lower[1]].swapaxes(-2, -1)
                 yield block, part, entries.transpose(0, 1, 3, 2, 4)
 
     def stresses(self, state: State) -> Stresses:
@@ -635,6 +684,12 @@ class Model:
         """The body that a point of the model belongs to, and the point's number in its mesh."""
         body = int(np.searchsorted(self.point_starts, point, side="right")) - 1
         return self.scene.bodies[body], int(point - self.point_starts[body])
+
+
+def _require_threads(threads: int) -> int:
+    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
+        raise SceneError(f"threads must be a whole number from 1 on, not {threads!r}")
+    return threads
 
 
 def _point_vectors(what: str, value: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

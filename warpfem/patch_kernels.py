@@ -187,39 +187,34 @@ def patch_kernels(measure: VolumetricMeasure, dim: int, dtype: str) -> SimpleNam
 
     @wp.kernel(module=module, enable_backward=False)
     def coupling_product(
-        inverse_modulus: wp.array(dtype=scalar),
         column_starts: wp.array(dtype=wp.int32),
         column_entries: wp.array(dtype=wp.int32),
         column_patches: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=vector),
         rate: wp.array(dtype=scalar),
-        own: scalar,
-        p: wp.array(dtype=vector),
         product_out: wp.array(dtype=vector),
     ):
-        """Adds r_g r_g^T p / L_g, less the blocks on the diagonal where ``own`` is 0."""
+        """Adds r_g r_g^T p / L_g."""
         i = wp.tid()
         total = vector()
         for k in range(column_starts[i], column_starts[i + 1]):
-            row = rows[column_entries[k]]
-            g = column_patches[k]
-            total += (rate[g] - (scalar(1.0) - own) * inverse_modulus[g] * wp.dot(row, p[i])) * row
+            total += rate[column_patches[k]] * rows[column_entries[k]]
         product_out[i] += total
 
     @wp.kernel(module=module, enable_backward=False)
     def coupling_diagonal(
         inverse_modulus: wp.array(dtype=scalar),
-        row_starts: wp.array(dtype=wp.int32),
-        points: wp.array(dtype=wp.int32),
+        column_starts: wp.array(dtype=wp.int32),
+        column_entries: wp.array(dtype=wp.int32),
+        column_patches: wp.array(dtype=wp.int32),
         rows: wp.array(dtype=vector),
-        diagonal: wp.array(dtype=wp.int32),
         blocks_out: wp.array(dtype=matrix),
     ):
         """Adds the blocks of r_g r_g^T / L_g on the diagonal."""
-        g = wp.tid()
-        for entry in range(row_starts[g], row_starts[g + 1]):
-            row = rows[entry]
-            wp.atomic_add(blocks_out, diagonal[points[entry]], wp.outer(inverse_modulus[g] * row, row))
+        i = wp.tid()
+        for k in range(column_starts[i], column_starts[i + 1]):
+            row = rows[column_entries[k]]
+            blocks_out[i] += wp.outer(inverse_modulus[column_patches[k]] * row, row)
 
     return SimpleNamespace(
         strain=strain_kernel(False),

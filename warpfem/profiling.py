@@ -10,6 +10,9 @@ from unittest.mock import patch
 
 import warp as wp
 
+GRAPH = ("iteration of conjugate gradients (a graph of the kernels)", "warpfem.graph")
+"""Name and module by which a graph of kernels is counted: no other is captured."""
+
 
 @dataclass
 class KernelUse:
@@ -40,9 +43,8 @@ class Launches:
 
     kernels: dict[tuple[str, str], KernelUse] = field(default_factory=dict)
 
-    def add(self, kernel: wp.Kernel, seconds: float) -> None:
-        """Counts a launch."""
-        key = (kernel.func.__name__, kernel.module.name)
+    def add(self, key: tuple[str, str], seconds: float) -> None:
+        """Counts a launch of the kernel with that name and module."""
         use = self.kernels.setdefault(key, KernelUse(*key))
         use.launches += 1
         use.seconds += seconds
@@ -55,24 +57,37 @@ class Launches:
 
 @contextmanager
 def observe_launches(device: wp.DeviceLike = None) -> Iterator[Launches]:
-    """Counts and times all kernel launches inside the block, each waited for on ``device``."""
-    seen = Launches()
-    launch, replay = wp.launch, wp.Launch.launch
+    """Counts and times all kernel launches inside the block, each waited for on ``device``.
 
-    def timed(kernel: wp.Kernel, call) -> object:
+    A graph of kernels counts as one kernel.
+    """
+    seen = Launches()
+    launch, replay, replay_graph = wp.launch, wp.Launch.launch, wp.capture_launch
+
+    def timed(key: tuple[str, str], call) -> object:
         start = time.perf_counter()
         result = call()
         wp.synchronize_device(device)
-        seen.add(kernel, time.perf_counter() - start)
+        seen.add(key, time.perf_counter() - start)
         return result
+
+    def key_of(kernel: wp.Kernel) -> tuple[str, str]:
+        return kernel.func.__name__, kernel.module.name
 
     def observed_launch(kernel, *args, **kwargs):
         if kwargs.get("record_cmd"):
             return launch(kernel, *args, **kwargs)
-        return timed(kernel, lambda: launch(kernel, *args, **kwargs))
+        return timed(key_of(kernel), lambda: launch(kernel, *args, **kwargs))
 
     def observed_replay(self, *args, **kwargs):
-        return timed(self.kernel, lambda: replay(self, *args, **kwargs))
+        return timed(key_of(self.kernel), lambda: replay(self, *args, **kwargs))
 
-    with patch.object(wp, "launch", observed_launch), patch.object(wp.Launch, "launch", observed_replay):
+    def observed_graph(*args, **kwargs):
+        return timed(GRAPH, lambda: replay_graph(*args, **kwargs))
+
+    with (
+        patch.object(wp, "launch", observed_launch),
+        patch.object(wp.Launch, "launch", observed_replay),
+        patch.object(wp, "capture_launch", observed_graph),
+    ):
         yield seen

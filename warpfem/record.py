@@ -111,6 +111,7 @@ def run(
     dtype: FloatName = "float32",
     checkpoint_every: int | None = None,
     resume: bool = False,
+    threads: int | None = None,
 ) -> Summary:
     """Runs a scene and stores it in the USD file ``path``, which is overwritten if it exists.
 
@@ -121,6 +122,7 @@ def run(
         dtype: "float32" or "float64".
         checkpoint_every: frames between two checkpoints; ``None`` writes none.
         resume: go on after the checkpoint of an earlier run, which differs in the number of frames at most.
+        threads: threads of the CPU that explicit steps may use; ``None`` takes all cores. Results are the same.
 
     Returns:
         What the run did, with what came before the checkpoint.
@@ -128,7 +130,7 @@ def run(
     Raises:
         SceneError, OutputError, SimulationError: as :class:`Simulation` and :func:`record`.
     """
-    simulation = Simulation(scene, device=device, dtype=dtype)
+    simulation = Simulation(scene, device=device, dtype=dtype, threads=threads)
     for _ in record(simulation, path, checkpoint_every=checkpoint_every, resume=resume):
         pass
     return simulation.summary

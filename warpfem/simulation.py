@@ -148,6 +148,7 @@ class Simulation:
         device: Warp device, for example "cpu" or "cuda:0"; ``None`` takes Warp's default.
         dtype: "float32" or "float64".
         solver: takes the place of the scene's.
+        threads: threads of the CPU that explicit steps may use; ``None`` takes all cores. Results are the same.
 
     Attributes:
         scene: the scene.
@@ -171,10 +172,11 @@ class Simulation:
         device: str | None = None,
         dtype: FloatName = "float32",
         solver: Solver | None = None,
+        threads: int | None = None,
     ) -> None:
         start = time.perf_counter()
         self.scene = scene if solver is None else replace(scene, solver=solver)
-        self.model = Model(self.scene, device=device, dtype=dtype)
+        self.model = Model(self.scene, device=device, dtype=dtype, threads=threads)
         self.state = self.model.state()
         self.solver = self.scene.solver
         self.stepper = self.solver.stepper(self.model)

@@ -49,6 +49,7 @@ class StaticSummary:
         newton_iterations, cg_iterations: totals over all of them.
         residual: largest unbalanced force at the last of them, relative to the largest of those acting.
         note: how that solve ended, if not by its tolerance.
+        linear_solver: what solved its linear systems, and why.
         stable: whether the stiffness at the end has no direction of negative curvature.
         energies: energies at the last of them [J], likewise all that follows.
         largest_displacement: [m].
@@ -68,6 +69,7 @@ class StaticSummary:
     cg_iterations: int = 0
     residual: float = 0.0
     note: str = ""
+    linear_solver: str = ""
     stable: bool = True
     energies: Energies | None = None
     largest_displacement: float = 0.0
@@ -162,6 +164,7 @@ class StaticRun:
             summary.cg_iterations += increment.report.cg_iterations
             summary.residual, summary.note = increment.report.residual, increment.report.note
             summary.stable = increment.stable
+            summary.linear_solver = increment.linear_solver
             summary.energies = frame.energies
             summary.largest_displacement = float(np.linalg.norm(frame.displacement, axis=1).max())
             summary.largest_von_mises = float(frame.von_mises.max())
@@ -241,6 +244,7 @@ def summary_text(summary: StaticSummary) -> str:
         f"equilibrium at t = {summary.time:.6g} s, in {steps} load step{'s' if steps > 1 else ''}: "
         f"{summary.newton_iterations} Newton and {summary.cg_iterations} conjugate gradient iterations",
         f"residual {summary.residual:.1e} of the largest force" + (f" ({summary.note})" if summary.note else ""),
+        f"linear systems: {summary.linear_solver}",
         f"wall time: {summary.setup_seconds:.2f} s to prepare, {summary.solving_seconds:.2f} s to solve",
     ]
     energies = summary.energies

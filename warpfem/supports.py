@@ -16,9 +16,9 @@ from warpfem.scene import Body
 
 @functools.cache
 def support_kernels(dim: int, dtype: str) -> SimpleNamespace:
-    """The kernels ``hold``, ``project`` and ``hold_rows``."""
+    """The kernels ``hold`` and ``project``."""
     t = types(dim, dtype)
-    vector, matrix, scalar = t.vector, t.matrix, t.scalar
+    vector, scalar = t.vector, t.scalar
     module = f"warpfem.supports_{dim}_{dtype}"
 
     @wp.kernel(module=module, enable_backward=False)
@@ -44,24 +44,7 @@ def support_kernels(dim: int, dtype: str) -> SimpleNamespace:
         i = points[k]
         vector_out[i] = wp.cw_mul(vector(scalar(1.0)) - held[k], vector_out[i])
 
-    @wp.kernel(module=module, enable_backward=False)
-    def hold_rows(
-        points: wp.array(dtype=wp.int32),
-        held: wp.array(dtype=vector),
-        row_starts: wp.array(dtype=wp.int32),
-        diagonal: wp.array(dtype=wp.int32),
-        blocks_out: wp.array(dtype=matrix),
-    ):
-        """Replaces the held rows of a block matrix by those of the identity."""
-        k = wp.tid()
-        i = points[k]
-        keep = wp.diag(vector(scalar(1.0)) - held[k])
-        for slot in range(row_starts[i], row_starts[i + 1]):
-            blocks_out[slot] = keep * blocks_out[slot]
-        # the columns of the diagonal block too, so that it can be inverted
-        blocks_out[diagonal[i]] = blocks_out[diagonal[i]] * keep + wp.diag(held[k])
-
-    return SimpleNamespace(hold=hold, project=project, hold_rows=hold_rows)
+    return SimpleNamespace(hold=hold, project=project)
 
 
 _SAMPLES = (0.25, 0.382, 0.5, 0.75)

@@ -32,6 +32,8 @@ class Constitutive:
         barrier: whether psi is infinite for J <= 0, so that a step may not lead there.
         differentiable: whether Warp can differentiate ``stress``: not if it calls ``wp.grad``, through which
             gradients silently do not flow.
+        branchless: whether ``stress`` has neither branches nor calls of library functions, so that the compiler can
+            work on several cells at once.
         volumetric: the measure theta if the energy is psi(F; mu, 0) + lam/2 theta^2, which averaged cells need; else
             ``None``.
     """
@@ -46,6 +48,7 @@ class Constitutive:
     corotated: bool = False
     barrier: bool = False
     differentiable: bool = True
+    branchless: bool = False
     volumetric: VolumetricMeasure | None = None
 
 

@@ -65,7 +65,7 @@ class StableNeoHookean(HookeanMaterial):
 
     name = "stable_neo_hookean"
     least_nu = -0.85
-    functions = Constitutive(energy_density, stress, stress_differential, volumetric=VOLUME_CHANGE)
+    functions = Constitutive(energy_density, stress, stress_differential, branchless=True, volumetric=VOLUME_CHANGE)
 
     def parameters(self) -> tuple[Parameter, ...]:
         mu, lam = self.moduli.mu, self.moduli.lam

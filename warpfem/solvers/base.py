@@ -63,12 +63,14 @@ class Stepper(ABC):
         adaptive: whether dt is chosen by :meth:`estimate_stable_dt`: then a dt above the limit of the moment is not
             refused, since the next one will be shorter.
         controls_error: whether dt shall follow the errors that :meth:`try_step` estimates.
+        linear_solver: what solves the linear systems of a step, and why; empty where there are none.
     """
 
     model: Model
     attempt: wp.array | None = None
     adaptive: bool = False
     controls_error: bool = False
+    linear_solver: str = ""
 
     @abstractmethod
     def step(self, state: State, dt: float) -> StepReport:

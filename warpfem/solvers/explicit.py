@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +11,22 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.errors import SimulationError, TimeStepError
 from warpfem.model import Model, State
+from warpfem.points import CHUNK, chunks
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, worst_cell
 from warpfem.solvers.stability import Watch, largest_frequency
+from warpfem.subnormals import SubnormalsFlushed
+from warpfem.threads import Job, Team, share
+from warpfem.vectorized import WINDOW
 
 TRACKING_INTERVALS = (16, 256)
 """Bounds of the steps after which the stability limit is estimated again, at the cost of some six steps: the fewer
 cells, the sooner a wave has crossed them, and the less it matters."""
+
+CELLS_PER_THREAD = 8192
+"""Cells for which a thread is worth while: handing over work costs as much as the forces of some thousand."""
+
+RECORDED_PASSES = 8
+"""Recorded passes kept: with a fixed dt there are two."""
 
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
@@ -28,6 +39,8 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def kick_drift(
+        first: int,
+        last: int,
         force: wp.array(dtype=vector),
         inverse_mass: wp.array(dtype=scalar),
         decay: scalar,
@@ -38,20 +51,76 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
         v_out: wp.array(dtype=vector),
         alarm_out: wp.array(dtype=wp.int32),
     ):
-        """v = decay v + kick f / m, then u += drift v; an alarm where |v| is not below a limit."""
-        i = wp.tid()
-        v = decay * v_out[i] + (kick * inverse_mass[i]) * force[i]
-        v_out[i] = v
-        u_out[i] += drift * v
-        if not (wp.length(v) <= watched_speed):
+        """v = decay v + kick f / m, then u += drift v of ``CHUNK`` points; an alarm where |v| is not below a limit."""
+        start = first + wp.tid() * CHUNK
+        forces = wp.array(ptr=force.ptr, shape=(0,), dtype=vector)  # views with a stride known at compile time, which
+        inverse = wp.array(ptr=inverse_mass.ptr, shape=(0,), dtype=scalar)  # spare a multiplication at each access
+        u = wp.array(ptr=u_out.ptr, shape=(0,), dtype=vector)
+        v = wp.array(ptr=v_out.ptr, shape=(0,), dtype=vector)
+        slow = int(1)
+        for i in range(start, wp.min(start + CHUNK, last)):
+            velocity = decay * v[i] + (kick * inverse[i]) * forces[i]
+            v[i] = velocity
+            u[i] = u[i] + drift * velocity
+            slow = wp.min(slow, wp.where(wp.length_sq(velocity) <= watched_speed * watched_speed, 1, 0))
+        if slow == 0:
             alarm_out[0] = 1
 
     return kick_drift
 
 
+class _Passes:
+    """A step of vectorised bodies as two passes of recorded launches, each divided among threads.
+
+    The first computes the forces of the strips, the second sums them for each point and moves it. Which thread does
+    what changes no bit of the result.
+    """
+
+    def __init__(self, model: Model, kick_drift: Callable[..., wp.Launch], force: wp.array) -> None:
+        self._forces = [block.vectorized for block in model.blocks]
+        self._kick_drift = kick_drift
+        self._force = force
+        self._team = Team(max(1, min(model.threads, model.cell_count // CELLS_PER_THREAD)))
+        self._points = share(model.point_count, self._team.size, WINDOW)
+        self._recorded: dict[tuple, tuple[list[Job], list[Job]]] = {}
+
+    def run(self, state: State, *settings: float) -> None:
+        key = (state.u.ptr, state.v.ptr, *settings)
+        if key not in self._recorded:
+            if len(self._recorded) == RECORDED_PASSES:
+                self._recorded.clear()
+            self._recorded[key] = self._record(state, *settings)
+        for jobs in self._recorded[key]:
+            self._team.run(jobs)
+
+    def _record(self, state: State, *settings: float) -> tuple[list[Job], list[Job]]:
+        first: list[list[wp.Launch]] = [[] for _ in self._points]
+        second: list[list[wp.Launch]] = [[] for _ in self._points]
+        for force in self._forces:
+            for launches, part in zip(first, share(force.chunk_count, self._team.size), strict=True):
+                launches.append(force.record_forces(state.u, part))
+            for launches, points in zip(second, self._points, strict=True):
+                launches.append(force.record_sums(self._force, points))
+        for launches, points in zip(second, self._points, strict=True):
+            launches.append(self._kick_drift(state, points, *settings, record=True))
+        return [_job(own) for own in first], [_job(own) for own in second]
+
+
+def _job(launches: list[wp.Launch]) -> Job:
+    flushed = SubnormalsFlushed()
+
+    def launch() -> None:
+        with flushed:
+            for own in launches:
+                own.launch()
+
+    return launch
+
+
 class _ExplicitStepper(Stepper):
     def __init__(self, model: Model) -> None:
         self.model = model
+        model.vectorize()
         self._kernel = _kick_drift_kernel(model.dim, model.dtype)
         self._force = model.zeros()
         self._rough = model.contact is not None and model.contact.rough
@@ -63,6 +132,9 @@ class _ExplicitStepper(Stepper):
         self._alarm_on_host = self._alarm.numpy() if model.device.is_cpu else None  # making the view costs a launch
         self._steps = 0
         self._interval = int(np.clip(model.cell_count // 16, *TRACKING_INTERVALS))
+        self._passes: _Passes | None = None
+        if all(block.vectorized for block in model.blocks):
+            self._passes = _Passes(model, self._launch_kick_drift, self._force)
 
     def arrays(self) -> list[wp.array]:
         return [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]
@@ -125,20 +197,37 @@ class _ExplicitStepper(Stepper):
             return bool(self._alarm_on_host[0])
         return self._steps % ALARM_INTERVAL == 0 and bool(self._alarm.numpy()[0])
 
+    def _evaluate(self, state: State, kick: float = 0.0, drift: float = 0.0) -> None:
+        """Takes the forces of the state, then as :meth:`_kick_drift`."""
+        if self._passes is None:
+            self.model.force(state.u, self._force)
+            if kick or drift:
+                self._kick_drift(state, kick, drift)
+            return
+        self.model.external_force(state.u, self._force)
+        self._passes.run(state, *self._impulse(kick), drift, self._watched_speed)
+
     def _kick_drift(self, state: State, kick: float, drift: float) -> None:
         """Lets forces and damping act for a time, as v' = f / m - alpha v has it, then moves for another."""
-        model = self.model
-        alpha = model.scene.damping
-        decay = 1.0
-        if alpha > 0.0:
-            decay = math.exp(-alpha * kick)
-            kick = -math.expm1(-alpha * kick) / alpha
-        wp.launch(
+        self._launch_kick_drift(state, range(self.model.point_count), *self._impulse(kick), drift, self._watched_speed)
+
+    def _impulse(self, kick: float) -> tuple[float, float]:
+        """What is left of the velocity after a time, and the time for which the force counts."""
+        alpha = self.model.scene.damping
+        if alpha == 0.0:
+            return 1.0, kick
+        return math.exp(-alpha * kick), -math.expm1(-alpha * kick) / alpha
+
+    def _launch_kick_drift(
+        self, state: State, points: range, decay: float, kick: float, drift: float, speed: float, record: bool = False
+    ) -> wp.Launch | None:
+        return wp.launch(
             self._kernel,
-            model.point_count,
-            inputs=[self._force, model.inverse_mass, decay, kick, drift, self._watched_speed],
+            chunks(len(points)),
+            inputs=[points.start, points.stop, self._force, self.model.inverse_mass, decay, kick, drift, speed],
             outputs=[state.u, state.v, self._alarm],
-            device=model.device,
+            device=self.model.device,
+            record_cmd=record,
         )
 
     def _hold(self, state: State) -> None:
@@ -158,13 +247,12 @@ class _ExplicitStepper(Stepper):
 class _SymplecticEulerStepper(_ExplicitStepper):
     def step(self, state: State, dt: float) -> StepReport:
         self._begin(state, dt)
-        self.model.force(state.u, self._force)
         if self._rough:  # friction acts between the new velocity and the drift
-            self._kick_drift(state, dt, 0.0)
+            self._evaluate(state, dt, 0.0)
             self._rub(state, dt)
             self._kick_drift(state, 0.0, dt)
         else:
-            self._kick_drift(state, dt, dt)
+            self._evaluate(state, dt, dt)
         self._hold(state)
         state.time += dt
         state.revision += 1
@@ -180,7 +268,7 @@ class _VelocityVerletStepper(_ExplicitStepper):
     def step(self, state: State, dt: float) -> StepReport:
         self._begin(state, dt)
         if self._known is None or self._known[0] is not state or self._known[1] != state.revision:
-            self.model.force(state.u, self._force)
+            self._evaluate(state)
         half = 0.5 * dt
         if self._rough:
             self._kick_drift(state, half, 0.0)
@@ -189,8 +277,7 @@ class _VelocityVerletStepper(_ExplicitStepper):
         else:
             self._kick_drift(state, half, dt)
         self._hold(state)
-        self.model.force(state.u, self._force)
-        self._kick_drift(state, half, 0.0)
+        self._evaluate(state, half, 0.0)
         self._rub(state, half)
         self._hold(state)
         state.time += dt

@@ -111,6 +111,10 @@ class ImplicitStepper(Stepper):
         self.controls_error = error is not None
         self._norm = ErrorNorm(model) if self.controls_error else None
 
+    @property
+    def linear_solver(self) -> str:
+        return str(self.newton.linear)
+
     def arrays(self) -> list[wp.array]:
         own = [array for pair in self._rates for array in pair]
         own += [*(self._base or ()), *([] if self._end is None else [self._end])]
@@ -177,6 +181,7 @@ class ImplicitStepper(Stepper):
         """
         model, newton, tableau = self.model, self.newton, self.config.tableau
         report: StepReport | None = None
+        newton.linear.forget()
         if model.contact is not None:
             model.contact.limit_friction(state.u)
         for index, row in enumerate(tableau.rows):

@@ -10,10 +10,10 @@ import warp as wp
 
 from warpfem.errors import SceneError, SimulationError
 from warpfem.folds import folds
-from warpfem.linear import LinearStatus
+from warpfem.linear import METHODS, LinearMethod, LinearStatus
 from warpfem.model import Model, State
 from warpfem.solvers.base import StepReport, require_count, require_tolerance, worst_cell
-from warpfem.solvers.newton import Newton, NewtonSettings
+from warpfem.solvers.newton import Newton, NewtonSettings, require_choice
 from warpfem.solvers.rigid_modes import free_rigid_modes
 
 LEAST_INCREMENT = 2.0**-8
@@ -34,6 +34,9 @@ MOST_BEND = 0.21
 
 JUMP = 2.0
 """Displacement per load, relative to that of the increment before, from which negative curvature means a jump."""
+
+LARGE_JUMP = 4.0
+"""The same where no negative curvature was met: Newton's method can step across it."""
 
 
 _UNSTABLE = (
@@ -56,11 +59,13 @@ class LoadIncrement:
         fraction: part of the loads and of the prescribed motions that acts, 1 at the end.
         report: how it was found.
         stable: whether its stiffness was found free of negative curvature; asked only at the end.
+        linear_solver: what solved the linear systems, and why.
     """
 
     fraction: float
     report: StepReport
     stable: bool = True
+    linear_solver: str = ""
 
 
 @dataclass(frozen=True)
@@ -79,16 +84,19 @@ class StaticEquilibrium:
         max_iterations: Newton iterations of one solve.
         load_steps: increments to apply at least; 1 tries to do without. Descent finds an equilibrium beyond a
             snap-through too, where increments stop with a message.
+        linear_solver: as of ``NewtonSettings``.
     """
 
     tolerance: float = 1e-5
     max_iterations: int = 200
     load_steps: int = 1
+    linear_solver: LinearMethod = "auto"
 
     def __post_init__(self) -> None:
         require_tolerance(self, "tolerance")
         require_count(self, "max_iterations", 2)
         require_count(self, "load_steps", 1)
+        require_choice(self, "linear_solver", METHODS)
 
     def solve(self, model: Model, state: State, time: float | None = None) -> StepReport:
         """Moves ``state`` to an equilibrium, at rest.
@@ -137,9 +145,7 @@ class StaticEquilibrium:
         end = state.time if time is None else time
         straight = model.supports is None or model.supports.bend(end, 0.0, 1.0) <= MOST_BEND
         if self.load_steps == 1 and straight:
-            newton = _StaticNewton(
-                model, NewtonSettings(self.tolerance, self.max_iterations, linear_iterations=LINEAR_ITERATIONS)
-            )
+            newton = _StaticNewton(model, self._newton(self.max_iterations), static=True)
             if model.supports is not None:
                 model.supports.advance(end, 0.0)
             try:
@@ -150,9 +156,14 @@ class StaticEquilibrium:
                 del newton  # and its arrays
             else:
                 newton.accept(state, end)
-                yield LoadIncrement(1.0, report)
+                yield LoadIncrement(1.0, report, linear_solver=str(newton.linear))
                 return
         yield from self._climb(model, state, end)
+
+    def _newton(self, iterations: int) -> NewtonSettings:
+        return NewtonSettings(
+            self.tolerance, iterations, linear_solver=self.linear_solver, linear_iterations=LINEAR_ITERATIONS
+        )
 
     def _climb(self, model: Model, state: State, end: float) -> Iterator[LoadIncrement]:
         """Applies loads and motions in increments, from the rest shape."""
@@ -162,7 +173,7 @@ class StaticEquilibrium:
             loaded.dead_load = wp.clone(model.dead_load)
             full = model.dead_load.numpy().copy()
         iterations = min(self.max_iterations, INCREMENT_ITERATIONS)
-        newton = _StaticNewton(loaded, NewtonSettings(self.tolerance, iterations, linear_iterations=LINEAR_ITERATIONS))
+        newton = _StaticNewton(loaded, self._newton(iterations), static=True, watchful=True)
         state.u.zero_()
         state.v.zero_()
         longest = 1.0 / self.load_steps
@@ -183,7 +194,8 @@ class StaticEquilibrium:
             try:
                 report = newton.solve(state)
                 next_rate = newton.distance() / (goal - fraction)
-                if newton.curved and (rate is None or next_rate > JUMP * rate or not newton.stable()):
+                newton.curved |= rate is not None and next_rate > LARGE_JUMP * rate
+                if newton.curved and (rate is None or next_rate > JUMP * rate):
                     raise SimulationError("the bodies jump from one equilibrium to another")
             except SimulationError as error:
                 length = 0.5 * (goal - fraction)
@@ -200,7 +212,7 @@ class StaticEquilibrium:
             stable = goal < 1.0 or newton.stable()
             if not stable:
                 warnings.warn(_SADDLE, stacklevel=2)
-            yield LoadIncrement(goal, report, stable)
+            yield LoadIncrement(goal, report, stable, str(newton.linear))
 
 
 def at_rest(model: Model) -> Model:
@@ -293,19 +305,23 @@ class _StaticNewton(Newton):
         return self.model.dot(self.d, self.d) ** 0.5
 
     def stable(self) -> bool:
-        """Whether conjugate gradients for a random force meet no negative curvature of the stiffness, but rounding.
+        """Whether the stiffness has no direction of negative curvature, but by rounding.
 
-        The residual of a direction of negative curvature never falls, so that they cannot pass it by.
+        The signs of a factor tell. Without one, conjugate gradients for a random force do: the residual of such a
+        direction never falls, so that they cannot pass it by.
         """
         model, potential = self.model, self.potential
+        potential.linearize(self.u, "exact")
+        definite = self.linear.definite(4.0 * model.types.epsilon)
+        if definite is not None:
+            return definite
         random = np.random.default_rng(0).standard_normal((model.point_count, model.dim))
         potential.force.assign(random.astype(model.types.numpy))
         if model.supports is not None:
             model.supports.project(potential.force)
-        potential.linearize(self.u, "exact")
         if super()._solve(1e-4).status is not LinearStatus.CURVATURE:
             return True
-        p, product = self.cg.direction
+        p, product = self.linear.direction
         blocks = np.linalg.inv(potential.operator.inverse_diagonal.numpy().astype(np.float64))
         size = np.einsum("pi,pij,pj->", p, blocks, p)
         return float(np.sum(p * product)) >= -4.0 * model.types.epsilon * size

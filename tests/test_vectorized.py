@@ -1,0 +1,136 @@
+"""Forces of several cells at a time: those of one at a time, with the same bits on any number of threads."""
+
+import numpy as np
+import pytest
+
+import warpfem as wf
+from warpfem.solvers import explicit
+from warpfem.strips import STRIP, cut_into_strips
+from warpfem.subnormals import SubnormalsFlushed
+from warpfem.threads import Team, share
+
+MESHES = {
+    "box": wf.Mesh.box((1, 1, 1), (6, 6, 6)),
+    "box of six": wf.Mesh.box((1, 1, 1), (3, 2, 2), split=6),
+    "one cube": wf.Mesh.box((1, 1, 1), (1, 1, 1)),
+    "rectangle": wf.Mesh.rectangle((2, 1), (30, 20)),
+    "two triangles": wf.Mesh.rectangle((1, 1), (1, 1)),
+}
+
+
+@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+def test_strips_hold_each_cell_once_with_its_points_in_a_row(mesh):
+    strips = cut_into_strips(mesh.points, mesh.cells)
+    assert sorted(strips.cells[strips.cells >= 0]) == list(range(mesh.cell_count))
+    for k in range(STRIP):
+        real = strips.cells[:, k] >= 0
+        own = np.sort(strips.points[real, k : k + mesh.dim + 1], axis=1)
+        np.testing.assert_array_equal(own, np.sort(mesh.cells[strips.cells[real, k]], axis=1))
+
+
+def test_most_strips_are_full():
+    mesh = MESHES["box"]
+    assert mesh.cell_count / len(cut_into_strips(mesh.points, mesh.cells).cells) > 2.8
+
+
+def _scene(mesh, material, **settings):
+    return wf.Scene(
+        [wf.Body("body", mesh, material)], wf.SymplecticEuler(), gravity=(0, -9.81, 0)[: mesh.dim], **settings
+    )
+
+
+@pytest.mark.parametrize("case", ["3D, single precision, one modulus", "2D, double precision, moduli per cell"])
+def test_the_forces_are_those_of_the_plain_kernel(case):
+    if case.startswith("3D"):
+        mesh, dtype, E, limit = MESHES["box"], "float32", 1e5, 2e-6
+    else:
+        mesh, dtype, limit = MESHES["rectangle"], "float64", 1e-14
+        E = np.linspace(1e5, 1e6, mesh.cell_count)
+    model = wf.Model(_scene(mesh, wf.StableNeoHookean(E=E, nu=0.3)), device="cpu", dtype=dtype)
+    state = model.state()
+    state.assign(displacement=0.02 * np.random.default_rng(0).normal(size=mesh.points.shape))
+    plain = model.internal_force(state)
+    model.vectorize()
+    assert model.blocks[0].vectorized is not None
+    difference = np.abs(model.internal_force(state) - plain).max()
+    assert 0.0 < difference <= limit * np.abs(plain).max()  # equal bits would be those of the plain kernel
+
+
+def test_small_bodies_and_materials_with_branches_keep_the_plain_kernel():
+    small = wf.Model(_scene(MESHES["one cube"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu")
+    branching = wf.Model(_scene(MESHES["box"], wf.FixedCorotated(E=1e5, nu=0.3)), device="cpu")
+    for model in (small, branching):
+        model.vectorize()
+        assert model.blocks[0].vectorized is None
+
+
+@pytest.mark.parametrize("solver", [wf.SymplecticEuler(), wf.VelocityVerlet()], ids=["symplectic Euler", "Verlet"])
+def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
+    monkeypatch.setattr(explicit, "CELLS_PER_THREAD", 256)
+    monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
+    monkeypatch.setattr(explicit, "WINDOW", 64)
+    mesh = MESHES["box"]
+    mesh = mesh.with_point_set("bottom", np.flatnonzero(mesh.points[:, 1] == 0.0))
+    results = []
+    for threads in (1, 2, 3):
+        body = wf.Body("body", mesh, wf.StableNeoHookean(E=1e5, nu=0.3), supports=[wf.Pin("bottom")])
+        scene = wf.Scene([body], solver, gravity=(0, -9.81, 0), damping=1.0)
+        model = wf.Model(scene, device="cpu", threads=threads)
+        stepper, state = solver.stepper(model), model.state()
+        dt = 0.5 * stepper.stable_dt(state)
+        for _ in range(20):
+            stepper.step(state, dt)
+        results.append((state.displacement, state.velocity))
+    for displacement, velocity in results[1:]:
+        np.testing.assert_array_equal(displacement, results[0][0])
+        np.testing.assert_array_equal(velocity, results[0][1])
+
+
+def test_steps_of_vectorised_bodies_follow_those_of_plain_ones(monkeypatch):
+    motions = []
+    for least in (1, 10**9):
+        monkeypatch.setattr("warpfem.model.VECTORIZED_CELLS", least)
+        model = wf.Model(_scene(MESHES["box"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu")
+        state = model.state()
+        state.assign(velocity=np.random.default_rng(0).normal(size=state.velocity.shape))
+        stepper = wf.VelocityVerlet().stepper(model)
+        dt = 0.5 * stepper.stable_dt(state)
+        for _ in range(20):
+            stepper.step(state, dt)
+        motions.append(state.displacement)
+    assert np.abs(motions[0] - motions[1]).max() < 1e-5 * np.abs(motions[1]).max()
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1.5, True])
+def test_a_bad_number_of_threads_is_refused(threads):
+    with pytest.raises(wf.SceneError, match="threads must be a whole number from 1 on"):
+        wf.Model(_scene(MESHES["one cube"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu", threads=threads)
+
+
+def test_a_team_runs_all_jobs_and_passes_on_a_failure():
+    team, seen = Team(3), []
+    team.run([lambda: seen.append(0), lambda: seen.append(1), lambda: seen.append(2)])
+    assert sorted(seen) == [0, 1, 2]
+
+    def fail():
+        raise ValueError("a job")
+
+    with pytest.raises(ValueError, match="a job"):
+        team.run([lambda: None, fail])
+    team.run([lambda: seen.append(3)])
+    assert seen[-1] == 3
+
+
+def test_shares_cover_all_and_begin_at_whole_units():
+    parts = share(1000, 3, unit=64)
+    assert [i for part in parts for i in part] == list(range(1000))
+    assert all(part.start % 64 == 0 for part in parts)
+
+
+def test_subnormal_numbers_are_zero_only_within_the_context():
+    small = np.full(4, 1e-38, dtype=np.float32)
+    flushed = SubnormalsFlushed()
+    with flushed:
+        within = float((small * np.float32(0.01)).max())
+    assert within in (0.0, float(np.float32(1e-40)))  # processors other than x86 keep them
+    assert float((small * np.float32(0.01)).max()) == float(np.float32(1e-40))
