@@ -39,7 +39,7 @@ verify: $(VENV)/installed
 	$(BIN)/python benchmarks/verification --out docs/accuracy.md
 
 bench: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench,plot]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench,plot,solvers]'
 	$(BIN)/python benchmarks/performance --install --peers .peers --out docs/performance.md
 
 lint: $(VENV)/installed

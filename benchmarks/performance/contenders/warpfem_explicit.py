@@ -1,6 +1,5 @@
 """Steps of symplectic Euler with warpfem."""
 
-import inspect
 import time
 
 import numpy as np
@@ -24,12 +23,7 @@ def setup(problem, options):
     )
     dt, steps = float(problem["dt"]), options["steps"]
     scene = wf.Scene([body], wf.SymplecticEuler(), gravity=(0.0, 0.0, 0.0), dt=dt, fps=1.0 / dt, frames=1)
-    arguments = {}
-    if "threads" in inspect.signature(Simulation).parameters:
-        arguments["threads"] = options["threads"]
-    elif options["threads"] > 1:
-        raise SystemExit("this version of warpfem runs on one thread")
-    simulation = Simulation(scene, **arguments)
+    simulation = Simulation(scene, threads=options["threads"])
     model, stepper = simulation.model, simulation.stepper
     force = model.zeros()
     model.force(simulation.state.u, force)

@@ -1,7 +1,5 @@
 """One linearised step of backward Euler with warpfem, from the same state at each turn."""
 
-import inspect
-
 import numpy as np
 from serving import Contender, serve, timed
 
@@ -18,12 +16,7 @@ def setup(problem, options):
     dt = float(problem["dt"])
     solver = wf.BackwardEuler.linearised(linear_tolerance=options["tolerance"], **options["settings"])
     scene = wf.Scene([body], solver, gravity=(0.0, 0.0, 0.0), dt=dt, fps=1.0 / dt, frames=1)
-    arguments = {}
-    if "threads" in inspect.signature(Simulation).parameters:
-        arguments["threads"] = options["threads"]
-    elif options["threads"] > 1:
-        raise SystemExit("this version of warpfem runs on one thread")
-    simulation = Simulation(scene, **arguments)
+    simulation = Simulation(scene, threads=options["threads"])
     last = {}
 
     def run():

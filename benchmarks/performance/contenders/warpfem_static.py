@@ -1,7 +1,5 @@
 """The static equilibrium of a beam under its weight with warpfem, from its rest shape at each turn."""
 
-import inspect
-
 import numpy as np
 from serving import Contender, serve, timed
 
@@ -16,14 +14,11 @@ def setup(problem, options):
     body = wf.Body("beam", mesh, material, density=float(problem["density"]), supports=[wf.Pin("fixed")])
     scene = wf.Scene([body], wf.BackwardEuler(), gravity=(0.0, float(problem["gravity"]), 0.0))
     solver = wf.StaticEquilibrium(tolerance=options["tolerance"])
-    arguments = {"dtype": options["dtype"]}
-    if "threads" in inspect.signature(Model).parameters:
-        arguments["threads"] = options["threads"]
     last = {}
 
     def run():
         def solve():
-            model = Model(scene, **arguments)  # the others assemble anew too
+            model = Model(scene, dtype=options["dtype"], threads=options["threads"])  # the others assemble anew too
             state = model.state()
             last["report"] = solver.solve(model, state)
             last["displacement"] = state.displacement

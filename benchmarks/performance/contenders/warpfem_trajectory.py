@@ -1,7 +1,5 @@
 """The swing of a beam with warpfem, by several schemes and steps."""
 
-import inspect
-
 import numpy as np
 from serving import serve
 from trajectories import follow
@@ -15,16 +13,13 @@ def setup(problem, options):
     material = wf.StableNeoHookean(E=float(problem["E"]), nu=float(problem["nu"]))
     body = wf.Body("beam", mesh, material, density=float(problem["density"]), supports=[wf.Pin("fixed")])
     interval = float(problem["interval"])
-    arguments = {}
-    if "threads" in inspect.signature(Simulation).parameters:
-        arguments["threads"] = options["threads"]
 
     def prepare(setting):
         scheme, steps = setting
         solver = wf.BackwardEuler.linearised() if scheme == "linearised" else wf.SOLVERS[scheme]()
         gravity = (0.0, float(problem["gravity"]), 0.0)
         scene = wf.Scene([body], solver, gravity=gravity, dt=interval / steps, fps=1.0 / interval, frames=1)
-        simulation = Simulation(scene, **arguments)
+        simulation = Simulation(scene, threads=options["threads"])
         states = []
 
         def reset():
