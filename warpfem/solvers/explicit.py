@@ -19,7 +19,7 @@ from warpfem.subnormals import SubnormalsFlushed
 from warpfem.threads import Job, Team, share
 from warpfem.vectorized import WINDOW
 
-TRACKING_INTERVALS = (16, 256)
+TRACKING_INTERVALS = (16, 1024)
 """Bounds of the steps after which the stability limit is estimated again, at the cost of some six steps: the fewer
 cells, the sooner a wave has crossed them, and the less it matters."""
 
