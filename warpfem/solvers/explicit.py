@@ -2,7 +2,9 @@
 
 import functools
 import math
+from abc import abstractmethod
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,18 +111,21 @@ class _Passes:
                 launches.append(force.record_sums(self._force, points))
         for launches, points in zip(second, self._points, strict=True):
             launches.append(self._kick_drift(state, points, *settings, record=True))
-        return [_job(own) for own in first], [_job(own) for own in second]
+        return _jobs(first), _jobs(second)
 
 
-def _job(launches: list[wp.Launch]) -> Job:
-    flushed = SubnormalsFlushed()
+def _jobs(launches: list[list[wp.Launch]]) -> list[Job]:
+    """A job of launches for each thread; threads other than the calling one flush subnormal numbers by themselves."""
 
-    def launch() -> None:
-        with flushed:
-            for own in launches:
-                own.launch()
+    def job(own: list[wp.Launch], flushed: AbstractContextManager) -> Job:
+        def launch() -> None:
+            with flushed:
+                for each in own:
+                    each.launch()
 
-    return launch
+        return launch
+
+    return [job(own, SubnormalsFlushed() if thread else nullcontext()) for thread, own in enumerate(launches)]
 
 
 class _ExplicitStepper(Stepper):
@@ -143,6 +148,15 @@ class _ExplicitStepper(Stepper):
         if all(block.vectorized for block in model.blocks):
             self._passes = _Passes(model, self._launch_kick_drift, self._force)
         self.forces = self._describe_forces()
+        self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
+
+    def step(self, state: State, dt: float) -> StepReport:
+        with self._flushed:
+            self._take_step(state, dt)
+        return StepReport()
+
+    @abstractmethod
+    def _take_step(self, state: State, dt: float) -> None: ...
 
     def _describe_forces(self) -> str:
         count = sum(block.count for block in self.model.blocks if block.vectorized)
@@ -276,7 +290,7 @@ class _ExplicitStepper(Stepper):
 
 
 class _SymplecticEulerStepper(_ExplicitStepper):
-    def step(self, state: State, dt: float) -> StepReport:
+    def _take_step(self, state: State, dt: float) -> None:
         self._begin(state, dt)
         if self._rough:  # friction acts between the new velocity and the drift
             self._evaluate(state, dt, 0.0)
@@ -288,7 +302,6 @@ class _SymplecticEulerStepper(_ExplicitStepper):
         state.time += dt
         state.revision += 1
         self._look(state, dt)
-        return StepReport()
 
 
 class _VelocityVerletStepper(_ExplicitStepper):
@@ -296,7 +309,7 @@ class _VelocityVerletStepper(_ExplicitStepper):
         super().__init__(model)
         self._known: tuple[State, int] | None = None  # state and revision that the force belongs to
 
-    def step(self, state: State, dt: float) -> StepReport:
+    def _take_step(self, state: State, dt: float) -> None:
         self._begin(state, dt)
         if self._known is None or self._known[0] is not state or self._known[1] != state.revision:
             self._evaluate(state)
@@ -315,7 +328,6 @@ class _VelocityVerletStepper(_ExplicitStepper):
         state.revision += 1
         self._known = (state, state.revision)
         self._look(state, dt)
-        return StepReport()
 
 
 @dataclass(frozen=True)
