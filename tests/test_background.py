@@ -79,6 +79,17 @@ def test_a_frame_that_cannot_be_stored_is_told(tmp_path, how):
     assert not partial_path(tmp_path / "run.usdc").exists()
 
 
+def test_a_writer_that_fails_otherwise_is_closed_too():
+    class Failing(Slow):
+        def write_frame(self, frames: list[int]) -> None:
+            raise MemoryError
+
+    failing = Failing()
+    with pytest.raises(MemoryError), BackgroundWriter(failing) as writer:
+        writer.write_frame([0])
+    assert failing.stored == [-2]
+
+
 def test_what_the_caller_does_with_a_frame_does_not_reach_the_file():
     body = wf.Body("cube", wf.Mesh.box((1, 1, 1), (1, 1, 1)), wf.StableNeoHookean(E=1e5, nu=0.3), density=1000)
     simulation = wf.Simulation(wf.Scene([body], wf.BackwardEuler(), frames=0))

@@ -6,7 +6,6 @@ import threading
 from collections.abc import Sequence
 from types import TracebackType
 
-from warpfem.errors import OutputError
 from warpfem.usd.bodies import BodyFrame
 from warpfem.usd.writer import UsdWriter
 
@@ -53,11 +52,11 @@ class BackgroundWriter:
     ) -> None:
         try:
             self._wait()
-        except OutputError as late:
+        except Exception as late:  # as whatever stores the frame has raised it
             if error is None or kind is GeneratorExit:  # which nobody gets to see
                 self._writer.__exit__(type(late), late, late.__traceback__)
                 raise
-            error.add_note(str(late))
+            error.add_note(str(late) or type(late).__name__)
         self._writer.__exit__(kind, error, traceback)
 
     def _write(self, frames: Sequence[BodyFrame]) -> None:
