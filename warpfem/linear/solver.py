@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, TypeAlias
 
+import numpy as np
 import warp as wp
 
 from warpfem.errors import SceneError
@@ -108,8 +109,7 @@ def _require_installed(method: str) -> None:
 
 def _poisson_ratio(model: Model) -> float:
     """The largest of the bodies' that have one; averaged cells resist the change of volume by themselves too."""
-    ratios = [getattr(body.material, "nu", 0.0) for body in model.scene.bodies]
-    return max(float(max(ratio)) if hasattr(ratio, "__len__") else float(ratio) for ratio in ratios)
+    return max(float(np.max(getattr(body.material, "nu", 0.0))) for body in model.scene.bodies)
 
 
 def _strong(method: str, operator: AssembledOperator) -> RenewedPreconditioner:
