@@ -1,5 +1,11 @@
 """Forces of several cells at a time: those of one at a time, with the same bits on any number of threads."""
 
+import gc
+import signal
+import threading
+import time
+import weakref
+
 import numpy as np
 import pytest
 
@@ -75,6 +81,8 @@ def test_small_bodies_and_materials_with_branches_keep_the_plain_kernel():
 
 @pytest.mark.parametrize("solver", [wf.SymplecticEuler(), wf.VelocityVerlet()], ids=["symplectic Euler", "Verlet"])
 def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
+    """With a body that is large enough for all threads, and one of another material that is too small for that."""
+    monkeypatch.setattr("warpfem.model.VECTORIZED_CELLS", 64)
     monkeypatch.setattr(explicit, "CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
     monkeypatch.setattr(explicit, "WINDOW", 64)
@@ -83,7 +91,8 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     results = []
     for threads in (1, 2, 3):
         body = wf.Body("body", mesh, wf.StableNeoHookean(E=1e5, nu=0.3), supports=[wf.Pin("bottom")])
-        scene = wf.Scene([body], solver, gravity=(0, -9.81, 0), damping=1.0)
+        small = wf.Body("small", MESHES["box of six"], wf.LinearElasticity(E=1e5, nu=0.3))
+        scene = wf.Scene([body, small], solver, gravity=(0, -9.81, 0), damping=1.0)
         model = wf.Model(scene, device="cpu", threads=threads)
         stepper, state = solver.stepper(model), model.state()
         dt = 0.5 * stepper.stable_dt(state)
@@ -128,6 +137,38 @@ def test_a_team_runs_all_jobs_and_passes_on_a_failure():
         team.run([lambda: None, fail])
     team.run([lambda: seen.append(3)])
     assert seen[-1] == 3
+
+
+@pytest.mark.parametrize("where", ["while the caller waits", "as news reach the caller"])
+def test_an_interrupted_team_waits_for_all_before_it_tells(where):
+    team, seen = Team(2), []
+
+    def interrupt():
+        time.sleep(0.05)
+        waiting = where == "while the caller waits"  # else its wait goes on until the job has ended
+        signal.pthread_kill(threading.main_thread().ident if waiting else threading.get_ident(), signal.SIGINT)
+        time.sleep(0.05)
+        seen.append(1)
+
+    with pytest.raises(KeyboardInterrupt):
+        team.run([lambda: None, interrupt])
+    assert seen == [1]
+    team.run([lambda: None, lambda: (time.sleep(0.05), seen.append(2))])  # waits for this job, not that before
+    assert seen == [1, 2]
+
+
+def test_an_explicit_stepper_goes_with_its_last_reference():
+    model = wf.Model(_scene(MESHES["box"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu")
+    stepper, state = model.scene.solver.stepper(model), model.state()
+    stepper.step(state, 0.5 * stepper.stable_dt(state))
+    known = weakref.ref(stepper)
+    gc.collect()
+    gc.disable()
+    try:
+        del stepper
+        assert known() is None
+    finally:
+        gc.enable()
 
 
 def test_shares_cover_all_and_begin_at_whole_units():

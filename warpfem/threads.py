@@ -10,6 +10,12 @@ from queue import SimpleQueue
 
 Job = Callable[[], None]
 
+Outcomes = list[BaseException | None]
+"""Of the jobs that have ended: what they have raised."""
+
+Task = tuple[Job, Outcomes, SimpleQueue[None]]
+"""A job, where its outcome goes, and what tells the caller to look there."""
+
 
 def available_threads() -> int:
     """Cores that this process may use."""
@@ -27,43 +33,52 @@ class Team:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._inboxes: list[SimpleQueue[Job | None]] = [SimpleQueue() for _ in range(size - 1)]
-        self._outbox: SimpleQueue[BaseException | None] = SimpleQueue()
+        self._inboxes: list[SimpleQueue[Task | None]] = [SimpleQueue() for _ in range(size - 1)]
         for inbox in self._inboxes:
-            threading.Thread(target=_work, args=(inbox, self._outbox), daemon=True).start()
+            threading.Thread(target=_work, args=(inbox,), daemon=True).start()
 
     def run(self, jobs: Sequence[Job]) -> None:
         """Runs at most ``size`` jobs at the same time, the first by the calling thread, and waits for all.
 
         Raises:
-            BaseException: what a job has raised, once all have ended.
+            BaseException: what a job has raised, or an interrupt, once all have ended: until then they work on arrays
+                that the caller might free.
         """
         others = jobs[1:]
+        outcomes: Outcomes = []
+        news: SimpleQueue[None] = SimpleQueue()
+        failures: list[BaseException] = []
         for inbox, job in zip(self._inboxes, others, strict=False):
-            inbox.put(job)
-        outcomes: list[BaseException | None] = []
+            inbox.put((job, outcomes, news))
         try:
             jobs[0]()
         except BaseException as failure:
-            outcomes.append(failure)
-        outcomes += [self._outbox.get() for _ in others]
-        for outcome in outcomes:
-            if outcome is not None:
-                raise outcome
+            failures.append(failure)
+        while len(outcomes) < len(others):
+            try:
+                while len(outcomes) < len(others):
+                    news.get()
+            except KeyboardInterrupt as interrupt:
+                failures.append(interrupt)
+        failures += [outcome for outcome in outcomes if outcome is not None]
+        if failures:
+            raise failures[0]
 
     def __del__(self) -> None:
         for inbox in self._inboxes:
             inbox.put(None)
 
 
-def _work(inbox: SimpleQueue[Job | None], outbox: SimpleQueue[BaseException | None]) -> None:
-    while (job := inbox.get()) is not None:
+def _work(inbox: SimpleQueue[Task | None]) -> None:
+    while (task := inbox.get()) is not None:
+        job, outcomes, news = task
         try:
             job()
         except BaseException as failure:
-            outbox.put(failure)
+            outcomes.append(failure)
         else:
-            outbox.put(None)
+            outcomes.append(None)
+        news.put(None)  # may be lost to an interrupt, unlike the outcome
 
 
 def share(count: int, parts: int, unit: int = 1) -> list[range]:

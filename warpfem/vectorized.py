@@ -250,15 +250,18 @@ class VectorizedForce:
         """The device arrays held."""
         return [*self.arrays_by_name.values(), self._strip_forces, *self._lists]
 
-    def record_forces(self, u: wp.array, chunks: range) -> wp.Launch:
-        """The launch that computes the forces of a range of chunks at the displacements ``u``."""
+    def record_forces(self, u: wp.array, chunks: range) -> wp.Launch | None:
+        """The launch that computes the forces of a range of chunks at the displacements ``u``; ``None`` for none."""
         inputs = [chunks.start, *self.arrays_by_name.values(), u]
         return wp.launch(
             self._force, len(chunks), inputs=inputs, outputs=[self._strip_forces], device="cpu", record_cmd=True
         )
 
-    def record_sums(self, force_out: wp.array, points: range) -> wp.Launch:
-        """The launch that then adds the forces on a range of points, of whole windows, to ``force_out``."""
+    def record_sums(self, force_out: wp.array, points: range) -> wp.Launch | None:
+        """The launch that then adds the forces on a range of points, of whole windows, to ``force_out``.
+
+        ``None`` where none of the points is of these cells.
+        """
         ends = np.searchsorted(self.windows, [points.start // WINDOW, -(-points.stop // WINDOW)])
         first, last = self.group_starts[ends].tolist()
         inputs = [first, *self._lists, self._strip_forces]

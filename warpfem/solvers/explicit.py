@@ -35,6 +35,9 @@ ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
 
 
+KickDrift = Callable[..., wp.Launch | None]
+
+
 @functools.cache
 def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
     t = types(dim, dtype)
@@ -80,9 +83,8 @@ class _Passes:
     what changes no bit of the result.
     """
 
-    def __init__(self, model: Model, kick_drift: Callable[..., wp.Launch], force: wp.array) -> None:
+    def __init__(self, model: Model, force: wp.array) -> None:
         self._forces = [block.vectorized for block in model.blocks]
-        self._kick_drift = kick_drift
         self._force = force
         self._team = Team(max(1, min(model.threads, model.cell_count // CELLS_PER_THREAD)))
         self._points = share(model.point_count, self._team.size, WINDOW)
@@ -92,30 +94,41 @@ class _Passes:
     def thread_count(self) -> int:
         return self._team.size
 
-    def run(self, state: State, *settings: float) -> None:
+    def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
+        """Takes the step.
+
+        Args:
+            kick_drift: what launches the move, :meth:`_ExplicitStepper._launch_kick_drift`; not kept, because a stepper
+                that its passes hold would stay with all its arrays until Python looks for cycles.
+            state: the state.
+            settings: of the move.
+        """
         key = (state.u.ptr, state.v.ptr, *settings)
         if key not in self._recorded:
             if len(self._recorded) == RECORDED_PASSES:
                 self._recorded.clear()
-            self._recorded[key] = self._record(state, *settings)
+            self._recorded[key] = self._record(kick_drift, state, *settings)
         for jobs in self._recorded[key]:
             self._team.run(jobs)
 
-    def _record(self, state: State, *settings: float) -> tuple[list[Job], list[Job]]:
-        first: list[list[wp.Launch]] = [[] for _ in self._points]
-        second: list[list[wp.Launch]] = [[] for _ in self._points]
+    def _record(self, kick_drift: KickDrift, state: State, *settings: float) -> tuple[list[Job], list[Job]]:
+        first: list[list[wp.Launch | None]] = [[] for _ in self._points]
+        second: list[list[wp.Launch | None]] = [[] for _ in self._points]
         for force in self._forces:
             for launches, part in zip(first, share(force.chunk_count, self._team.size), strict=True):
                 launches.append(force.record_forces(state.u, part))
             for launches, points in zip(second, self._points, strict=True):
                 launches.append(force.record_sums(self._force, points))
         for launches, points in zip(second, self._points, strict=True):
-            launches.append(self._kick_drift(state, points, *settings, record=True))
+            launches.append(kick_drift(state, points, *settings, record=True))
         return _jobs(first), _jobs(second)
 
 
-def _jobs(launches: list[list[wp.Launch]]) -> list[Job]:
-    """A job of launches for each thread; threads other than the calling one flush subnormal numbers by themselves."""
+def _jobs(launches: list[list[wp.Launch | None]]) -> list[Job]:
+    """A job of launches for each thread; threads other than the calling one flush subnormal numbers by themselves.
+
+    Where a thread has no part in a body, Warp records ``None``.
+    """
 
     def job(own: list[wp.Launch], flushed: AbstractContextManager) -> Job:
         def launch() -> None:
@@ -125,7 +138,10 @@ def _jobs(launches: list[list[wp.Launch]]) -> list[Job]:
 
         return launch
 
-    return [job(own, SubnormalsFlushed() if thread else nullcontext()) for thread, own in enumerate(launches)]
+    return [
+        job([each for each in own if each is not None], SubnormalsFlushed() if thread else nullcontext())
+        for thread, own in enumerate(launches)
+    ]
 
 
 class _ExplicitStepper(Stepper):
@@ -146,7 +162,7 @@ class _ExplicitStepper(Stepper):
         self._interval = int(np.clip(model.cell_count // 16, *TRACKING_INTERVALS))
         self._passes: _Passes | None = None
         if all(block.vectorized for block in model.blocks):
-            self._passes = _Passes(model, self._launch_kick_drift, self._force)
+            self._passes = _Passes(model, self._force)
         self.forces = self._describe_forces()
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
 
@@ -239,7 +255,7 @@ class _ExplicitStepper(Stepper):
                 self._kick_drift(state, kick, drift)
             return
         self.model.external_force(state.u, self._force)
-        self._passes.run(state, *self._impulse(kick), drift, self._watched_speed)
+        self._passes.run(self._launch_kick_drift, state, *self._impulse(kick), drift, self._watched_speed)
 
     def _kick_drift(self, state: State, kick: float, drift: float) -> None:
         """Lets forces and damping act for a time, as v' = f / m - alpha v has it, then moves for another."""
