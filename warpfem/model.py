@@ -211,6 +211,7 @@ class CellBlock:
 
     def vectorize(self, rest_points: np.ndarray) -> None:
         """Prepares the force of several cells at a time, where that is possible and pays."""
+        # a GPU has lanes of its own, and adds to points by atomics, which it does well
         possible = self.device.is_cpu and self.shape.order == 1 and not self.averaged
         if self.vectorized or not possible or not self.kernels.constitutive.branchless or self.count < VECTORIZED_CELLS:
             return
