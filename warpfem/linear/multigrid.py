@@ -204,7 +204,8 @@ def _inverse(matrices: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     m = matrices.shape[-1]
     diagonal = matrices[..., range(m), range(m)]
-    absent = diagonal <= 1e-12 * np.abs(diagonal).max(axis=-1, keepdims=True)
+    least = 1e-12 * np.abs(diagonal).max(axis=-1, keepdims=True)
+    absent = np.abs(diagonal) <= least
     matrices = matrices.copy()
     matrices[..., range(m), range(m)] = np.where(absent, 1.0, diagonal)
     try:

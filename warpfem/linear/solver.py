@@ -84,6 +84,8 @@ def choose(model: Model, method: LinearMethod, assembled: bool, static: bool) ->
     locked = _poisson_ratio(model) >= LOCKED
     most = (MOST_FACTORED_LOCKED if locked else MOST_FACTORED)[model.dim]
     then = "cholesky" if unknowns <= most else "multigrid"
+    if find_spec(_PACKAGES["cholesky"]) is None and find_spec(_PACKAGES["multigrid"]) is not None and not locked:
+        then = "multigrid"  # as where there is no PARDISO
     size = f"{unknowns} unknowns in {model.dim}D" + (", nearly incompressible" if locked else "")
     if find_spec(_PACKAGES[then]) is None:
         return LinearChoice(
