@@ -2,13 +2,14 @@
 # make test   install and run the tests on the CPU
 # make slow   the long checks too
 # make verify the verification suite, which writes docs/accuracy.md
+# make bench  the benchmarks beside other codes, which write docs/performance.md
 # make lint   style and types
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow verify lint clean
+.PHONY: demo test slow verify bench lint clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -37,6 +38,10 @@ verify: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench,solvers]'
 	$(BIN)/python benchmarks/verification --out docs/accuracy.md
 
+bench: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench,plot,solvers]'
+	$(BIN)/python benchmarks/performance --install --peers .peers --out docs/performance.md
+
 lint: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	$(BIN)/ruff check .
@@ -44,4 +49,4 @@ lint: $(VENV)/installed
 	$(BIN)/mypy warpfem
 
 clean:
-	rm -rf $(VENV) output
+	rm -rf $(VENV) .peers output

@@ -43,6 +43,10 @@ class Launches:
         """The kernels, each once, in the order of their first launch."""
         return list(dict.fromkeys(launch.kernel for launch in self.counts if launch.kernel is not None))
 
+    def copy(self) -> "Launches":
+        """What has been launched so far."""
+        return Launches(self.counts.copy(), self.reads)
+
     def __sub__(self, other: "Launches") -> "Launches":
         return Launches(self.counts - other.counts, self.reads - other.reads)
 
@@ -63,9 +67,10 @@ def _launch_of(kernel: wp.Kernel, dim: Any, inputs: list, outputs: list) -> Laun
 
 @contextlib.contextmanager
 def recorded() -> Iterator[Launches]:
-    """Notes what is launched inside the ``with`` block; of recorded commands also those recorded earlier."""
+    """Notes what is launched inside the ``with`` block, where commands and graphs must be recorded too."""
     result = Launches()
     launch, copy, zero, read, replay = wp.launch, wp.copy, wp.array.zero_, wp.array.numpy, wp.Launch.launch
+    replay_graph, graphs = wp.capture_launch, {}
 
     def noted_launch(
         kernel: wp.Kernel, dim: Any, inputs: Any = (), outputs: Any = (), *args: Any, **options: Any
@@ -94,18 +99,34 @@ def recorded() -> Iterator[Launches]:
         result.reads += 1
         return read(array)
 
+    class NotedCapture(wp.ScopedCapture):
+        def __enter__(self) -> wp.ScopedCapture:
+            self._before = result.copy()
+            return super().__enter__()
+
+        def __exit__(self, *exception: Any) -> None:
+            super().__exit__(*exception)
+            graphs[self.graph] = (result - self._before).counts  # has been captured, and not run
+            result.counts = self._before.counts
+
+    def noted_replay_graph(graph: wp.Graph, *args: Any, **options: Any) -> None:
+        replay_graph(graph, *args, **options)
+        result.counts += graphs[graph]
+
     with (
         mock.patch.object(wp, "launch", noted_launch),
         mock.patch.object(wp, "copy", noted_copy),
         mock.patch.object(wp.array, "zero_", noted_zero),
         mock.patch.object(wp.array, "numpy", noted_read),
         mock.patch.object(wp.Launch, "launch", noted_replay),
+        mock.patch.object(wp, "ScopedCapture", NotedCapture),
+        mock.patch.object(wp, "capture_launch", noted_replay_graph),
     ):
         yield result
 
 
 def launches_of(work: Callable[[], object]) -> Launches:
-    """What ``work`` launches."""
+    """What ``work`` launches, which makes the commands and graphs of its own."""
     with recorded() as result:
         work()
     return result

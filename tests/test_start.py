@@ -17,6 +17,7 @@ SCENES = {
             "element_frequency_bound",
             "kick_drift",
             "warpfem.points_3_float32",
+            "warpfem.subnormals",
             "warpfem.supports_3_float32",
         },
     ),

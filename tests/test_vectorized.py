@@ -65,7 +65,7 @@ def test_the_forces_are_those_of_the_plain_kernel(kind, case):
     E = 1e5 if "one" in case else np.linspace(1e5, 1e6, mesh.cell_count)
     model = wf.Model(_scene(mesh, kind(E=E, nu=0.3)), device="cpu", dtype=dtype)
     state = model.state()
-    state.assign(displacement=0.01 * np.random.default_rng(0).normal(size=mesh.points.shape))
+    state.assign(displacement=0.03 * mesh.mean_edge_length * np.random.default_rng(0).normal(size=mesh.points.shape))
     plain = model.internal_force(state)
     model.vectorize()
     assert model.blocks[0].vectorized is not None

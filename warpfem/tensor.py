@@ -142,6 +142,22 @@ def cofactor_change(H: mat33):  # noqa: F811
 
 
 @wp.func
+def _atanh_series(w: Any):
+    """(atanh z - z) / z^3 for w = z^2 < 0.032."""
+    one = type(w)(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
+    series = one / type(w)(19.0)
+    series = series * w + one / type(w)(17.0)
+    series = series * w + one / type(w)(15.0)
+    series = series * w + one / type(w)(13.0)
+    series = series * w + one / type(w)(11.0)
+    series = series * w + one / type(w)(9.0)
+    series = series * w + one / type(w)(7.0)
+    series = series * w + one / type(w)(5.0)
+    series = series * w + one / type(w)(3.0)
+    return series
+
+
+@wp.func
 def log1p_deficit(y: Any):
     """y - ln(1 + y) without cancellation; NaN for y < -1.
 
@@ -151,25 +167,7 @@ def log1p_deficit(y: Any):
         return y - wp.log(type(y)(1.0) + y)
     z = y / (type(y)(2.0) + y)
     w = z * z
-    one = type(y)(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
-    series = one / type(y)(19.0)
-    series = series * w + one / type(y)(17.0)
-    series = series * w + one / type(y)(15.0)
-    series = series * w + one / type(y)(13.0)
-    series = series * w + one / type(y)(11.0)
-    series = series * w + one / type(y)(9.0)
-    series = series * w + one / type(y)(7.0)
-    series = series * w + one / type(y)(5.0)
-    series = series * w + one / type(y)(3.0)
-    return y * z - type(y)(2.0) * z * w * series
-
-
-@wp.func
-def log1p(y: Any):
-    """ln(1 + y), accurate for small y; NaN for y < -1."""
-    if wp.abs(y) > type(y)(0.3):
-        return wp.log(type(y)(1.0) + y)
-    return y - log1p_deficit(y)
+    return y * z - type(y)(2.0) * z * w * _atanh_series(w)
 
 
 @wp.func
@@ -187,7 +185,7 @@ def _binary_exponent(x: wp.float32):
 
 
 @wp.func
-def _binary_exponent(x: wp.float64):  # noqa: F811
+def _binary_exponent(x: wp.float64):
     e = (wp.cast(x, wp.int64) - wp.int64(0x3FE6A09E667F3BCD)) >> wp.int64(52)
     return wp.float64(e), wp.cast((wp.int64(1023) - e) << wp.int64(52), wp.float64)
 
@@ -199,7 +197,7 @@ def log_volume_ratio(H: Any):
     With J = 2^e (1 + y), ln J = e ln 2 + 2 atanh z, z = y / (2 + y), |z| < 0.18: without branches or calls, so that the
     compiler can take several at a time.
     """
-    one = H.dtype(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
+    one = H.dtype(1.0)
     j = volume_change(H)
     J = volume_ratio(H)
     e, scale = _binary_exponent(J)
@@ -207,16 +205,9 @@ def log_volume_ratio(H: Any):
     y = wp.where(near, j, J * scale - one)
     z = y / (H.dtype(2.0) + y)
     w = z * z
-    series = one / H.dtype(19.0)
-    series = series * w + one / H.dtype(17.0)
-    series = series * w + one / H.dtype(15.0)
-    series = series * w + one / H.dtype(13.0)
-    series = series * w + one / H.dtype(11.0)
-    series = series * w + one / H.dtype(9.0)
-    series = series * w + one / H.dtype(7.0)
-    series = series * w + one / H.dtype(5.0)
-    series = series * w + one / H.dtype(3.0)
-    value = wp.where(near, H.dtype(0.0), e) * H.dtype(0.6931471805599453) + H.dtype(2.0) * z * (one + w * series)
+    value = wp.where(near, H.dtype(0.0), e) * H.dtype(0.6931471805599453) + H.dtype(2.0) * z * (
+        one + w * _atanh_series(w)
+    )
     return wp.where(J > H.dtype(0.0), value, H.dtype(wp.nan))
 
 
