@@ -1,5 +1,6 @@
 """Forces of several cells at a time: those of one at a time, with the same bits on any number of threads."""
 
+import dataclasses
 import gc
 import signal
 import threading
@@ -52,7 +53,13 @@ def _scene(mesh, material, **settings):
         (wf.NeoHookean, "2D, double precision, moduli per cell"),
         *(
             pytest.param(kind, case, marks=pytest.mark.slow)
-            for kind in (wf.LinearElasticity, wf.StVenantKirchhoff, wf.NeoHookean, wf.StableNeoHookean)
+            for kind in (
+                wf.LinearElasticity,
+                wf.StVenantKirchhoff,
+                wf.NeoHookean,
+                wf.StableNeoHookean,
+                wf.FixedCorotated,
+            )
             for case in ("3D, double precision, moduli per cell", "2D, single precision, one modulus")
         ),
     ],
@@ -71,9 +78,33 @@ def test_the_forces_are_those_of_the_plain_kernel(kind, case):
     assert 0.0 < difference <= limit * np.abs(plain).max()  # equal bits would be those of the plain kernel
 
 
+def test_cells_that_the_direct_stress_leaves_out_have_that_of_the_plain_kernel():
+    """Fixed corotated from strains of 1e-7 to cells flattened and turned inside out."""
+    mesh = MESHES["box"]
+    model = wf.Model(_scene(mesh, wf.FixedCorotated(E=1e5, nu=0.3)), device="cpu")
+    noise = np.random.default_rng(0).normal(size=mesh.points.shape)
+    flattened = -mesh.points * (0.0, 0.0, 1.0)
+    motions = [1e-8 * noise, 0.01 * noise, flattened + 0.01 * noise, 0.1 * noise, noise]
+    states = [model.state() for _ in motions]
+    for state, motion in zip(states, motions, strict=True):
+        state.assign(displacement=motion)
+    expected = [model.internal_force(state) for state in states]
+    model.vectorize()
+    known = []
+    for state, plain in zip(states, expected, strict=True):
+        difference = np.abs(model.internal_force(state) - plain).max()
+        assert 0.0 < difference <= 2e-6 * np.abs(plain).max()
+        known.append(model.blocks[0].vectorized.known.numpy().mean())
+    assert known[:3] == [1.0, 1.0, 1.0]
+    assert 0.5 < known[4] < 1.0
+
+
 def test_small_bodies_and_materials_with_branches_keep_the_plain_kernel():
+    class Branching(wf.StableNeoHookean):
+        functions = dataclasses.replace(wf.StableNeoHookean.functions, branchless=False)
+
     small = wf.Model(_scene(MESHES["one cube"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu")
-    branching = wf.Model(_scene(MESHES["box"], wf.FixedCorotated(E=1e5, nu=0.3)), device="cpu")
+    branching = wf.Model(_scene(MESHES["box"], Branching(E=1e5, nu=0.3)), device="cpu")
     for model in (small, branching):
         model.vectorize()
         assert model.blocks[0].vectorized is None

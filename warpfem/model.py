@@ -211,9 +211,11 @@ class CellBlock:
 
     def vectorize(self, rest_points: np.ndarray) -> None:
         """Prepares the force of several cells at a time, where that is possible and pays."""
+        constitutive = self.kernels.constitutive
         # a GPU has lanes of its own, and adds to points by atomics, which it does well
         possible = self.device.is_cpu and self.shape.order == 1 and not self.averaged
-        if self.vectorized or not possible or not self.kernels.constitutive.branchless or self.count < VECTORIZED_CELLS:
+        possible = possible and (constitutive.branchless or constitutive.direct_stress is not None)
+        if self.vectorized or not possible or self.count < VECTORIZED_CELLS:
             return
         from warpfem.vectorized import VectorizedForce
 

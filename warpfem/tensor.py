@@ -39,6 +39,23 @@ def symmetric_part(A: Any):
 
 
 @wp.func
+def select(condition: bool, A: mat22, B: mat22):
+    """A if the condition holds, else B, chosen entry by entry: without a branch."""
+    for i in range(2):
+        for j in range(2):
+            B[i, j] = wp.where(condition, A[i, j], B[i, j])
+    return B
+
+
+@wp.func
+def select(condition: bool, A: mat33, B: mat33):  # noqa: F811
+    for i in range(3):
+        for j in range(3):
+            B[i, j] = wp.where(condition, A[i, j], B[i, j])
+    return B
+
+
+@wp.func
 def cofactor(A: mat22):
     """cof A = d(det A)/dA, defined for every A."""
     return wp.matrix_from_rows(wp.vector(A[1, 1], -A[1, 0]), wp.vector(-A[0, 1], A[0, 0]))
@@ -361,56 +378,73 @@ def signed_svd(F: mat33):  # noqa: F811
 
 
 @wp.func
+def direct_rotation(F: mat22):
+    """:func:`polar_rotation` without branches, and 1: it holds for every F."""
+    return polar_rotation(F), 1
+
+
+@wp.func
+def direct_rotation(F: mat33):  # noqa: F811
+    """:func:`polar_rotation` without branches, and whether it holds (1) or not (0).
+
+    With |F| = 1, i1 = tr S is the largest root of l^4 - 2 l^2 - 8 J l + 1 - 4 |cof F|^2, the characteristic polynomial
+    of Davenport's matrix. All its roots are real, and from sqrt(3) on Laguerre's method falls to the largest at third
+    order. By Cayley-Hamilton, with i2 and J the other invariants of S,
+    R = ((i1^2 - i2) F + i1 cof F - F F^T F) / (i1 i2 - J). It holds unless that denominator, the product of the sums of
+    two singular values, nearly vanishes: in a dense sample of those that hold, four steps leave 1e-12 in i1.
+    """
+    one = F.dtype(1.0)
+    half = F.dtype(0.5)
+    least = F.dtype(5.0e-2)
+    A = F * (one / wp.sqrt(wp.ddot(F, F)))
+    C = cofactor(A)
+    J = wp.determinant(A)
+    c0 = one - F.dtype(4.0) * wp.ddot(C, C)
+    i1 = F.dtype(1.7320508075688772)
+    for _step in range(4):
+        square = i1 * i1
+        value = (square - F.dtype(2.0)) * square - F.dtype(8.0) * J * i1 + c0
+        slope = i1 * (square - one) - F.dtype(2.0) * J  # a quarter of it
+        bend = F.dtype(9.0) * slope * slope - F.dtype(3.0) * value * (F.dtype(3.0) * square - one)
+        i1 = i1 - value / wp.max(slope + wp.sqrt(wp.max(bend, F.dtype(0.0))), F.dtype(1.0e-6))
+    i2 = half * (i1 * i1 - one)
+    denominator = i1 * i2 - J
+    inverse = one / wp.max(denominator, least)
+    R = ((i1 * i1 - i2) * A + i1 * C - A * (wp.transpose(A) * A)) * inverse
+    R = R * (F.dtype(1.5) * identity_like(F) - half * (wp.transpose(R) * R))  # the rotation nearest to R
+    M = wp.transpose(R) * A
+    pair_sums = wp.trace(M) * identity_like(M) - symmetric_part(M)
+    axial = wp.vector(M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1])
+    R = R + R * skew(cofactor(pair_sums) * axial * inverse)  # Newton on skew(R^T A) = 0
+    return R, wp.where(denominator > least, 1, 0)
+
+
+@wp.func
 def polar_rotation(F: mat22):
     """The proper rotation R of F = R S with S symmetric and tr S >= 0: the rotation closest to F."""
+    one = F.dtype(1.0)
+    zero = F.dtype(0.0)
     c = F[0, 0] + F[1, 1]
     s = F[1, 0] - F[0, 1]
     r = wp.length(wp.vector(c, s))
-    if r > F.dtype(0.0):
-        c = c / r
-        s = s / r
-        return wp.matrix_from_rows(wp.vector(c, -s), wp.vector(s, c))
-    return identity_like(F)
+    c = wp.where(r > zero, c / r, one)
+    s = wp.where(r > zero, s / r, zero)
+    return wp.matrix_from_rows(wp.vector(c, -s), wp.vector(s, c))
 
 
 @wp.func
 def polar_rotation(F: mat33):  # noqa: F811
     """The proper rotation R of F = R S closest to F, also for inverted F (there S has a negative eigenvalue).
 
-    i1 = tr S is the largest root of l^4 - 2 |F|^2 l^2 - 8 J l + |F|^4 - 4 |cof F|^2, the characteristic
-    polynomial of Davenport's matrix; by Cayley-Hamilton, with i2 and J the other invariants of S,
-    R = ((i1^2 - i2) F + i1 cof F - F F^T F) / (i1 i2 - J). Where that denominator (the product of the sums
-    of two singular values) nearly vanishes, the signed singular value decomposition decides.
+    The direct one; where that does not hold, the signed singular value decomposition decides.
     """
-    one = F.dtype(1.0)
-    norm = wp.sqrt(wp.ddot(F, F))
-    if not (norm > F.dtype(0.0)):
+    R, holds = direct_rotation(F)
+    if holds == 1:
+        return R
+    if not (wp.ddot(F, F) > F.dtype(0.0)):
         return identity_like(F)
-    A = F * (one / norm)
-    C = cofactor(A)
-    J = wp.determinant(A)
-    c0 = one - F.dtype(4.0) * wp.ddot(C, C)
-    i1 = F.dtype(1.7320508075688772)
-    iterations = int(12)
-    for _iteration in range(iterations):
-        square = i1 * i1
-        value = (square - F.dtype(2.0)) * square - F.dtype(8.0) * J * i1 + c0
-        slope = F.dtype(4.0) * i1 * (square - one) - F.dtype(8.0) * J
-        step = value / wp.max(slope, F.dtype(1.0e-6))
-        i1 = i1 - step
-        if wp.abs(step) < F.dtype(1.0e-5):
-            break  # the next error is of the order of the square, and the polish squares it twice more
-    i2 = F.dtype(0.5) * (i1 * i1 - one)
-    denominator = i1 * i2 - J
-    if not (denominator > F.dtype(2.0e-3)):
-        U, _s, V = signed_svd(F)
-        return U * wp.transpose(V)
-    R = ((i1 * i1 - i2) * A + i1 * C - A * wp.transpose(A) * A) * (one / denominator)
-    half = F.dtype(0.5)
-    for _polish in range(2):  # the rotation nearest to R, then Newton on skew(R^T A) = 0
-        R = R * (F.dtype(1.5) * identity_like(F) - half * (wp.transpose(R) * R))
-        R = R + R * skew(_rotation_rate(R, A, A - R * symmetric_part(wp.transpose(R) * A)))
-    return R * (F.dtype(1.5) * identity_like(F) - half * (wp.transpose(R) * R))
+    U, _s, V = signed_svd(F)
+    return U * wp.transpose(V)
 
 
 @wp.func
@@ -444,9 +478,7 @@ def _rotation_rate(R: mat33, F: mat33, G: mat33):
     size = wp.trace(A)
     floor = _least_stretch_sum(size) * wp.abs(size) * size * size + F.dtype(1.0e-30)
     determinant = wp.determinant(A)
-    if wp.abs(determinant) < floor:
-        determinant = floor
-    return cofactor(A) * axial / determinant
+    return cofactor(A) * axial / wp.where(wp.abs(determinant) < floor, floor, determinant)
 
 
 @wp.func

@@ -5,7 +5,8 @@ place, which the compiler turns into vector code of the width that the processor
 strips go to an array of their own; a second kernel sums them for each point through an index list, always in the same
 order: without atomics, with the same bits however the tasks are divided among threads.
 
-What lets the compiler do it: the material's stress has no branches (``Constitutive.branchless``); results are kept on
+What lets the compiler do it: the material's stress has no branches (``Constitutive.branchless``), or one without them
+that tells where it holds (``direct_stress``; the remaining cells are then taken one at a time); results are kept on
 the stack until the loop ends, where they cannot alias its inputs; arrays are seen through views of length 0 (Warp adds
 the length to negative indices, and adding 0 needs no test) with strides that are known at compile time.
 """
@@ -20,6 +21,7 @@ from warpfem.dtypes import types
 from warpfem.elements import ElementKernels
 from warpfem.materials.base import Constitutive
 from warpfem.strips import STRIP, cut_into_strips
+from warpfem.tensor import select
 
 CHUNK = 64
 """Strips of one task: their forces (4.6 kB in single precision) fit the first-level cache with all else."""
@@ -39,15 +41,57 @@ def _compiler_flags(depth: int) -> str:
     return f"{flags} -mllvm=-slp-recursion-max-depth={depth}"
 
 
+class _Readers:
+    """Kernel functions that read what a cell of a strip has, from blocked arrays."""
+
+    def __init__(self, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
+        t = types(dim, dtype)
+        scalar, vector, matrix = t.scalar, t.vector, t.matrix
+        parameter_vector = wp.types.vector(length=parameter_count, dtype=scalar)
+        width = STRIP + dim
+
+        @wp.func
+        def displacement(points: wp.array(dtype=wp.int32), u: wp.array(dtype=scalar), chunk: int, a: int, lane: int):
+            """Of point ``a`` of a strip."""
+            offset = points[(chunk * wp.static(width) + a) * wp.static(CHUNK) + lane]
+            value = vector()
+            for i in range(wp.static(dim)):
+                value[i] = u[offset + i]
+            return value
+
+        @wp.func
+        def gradients(B: wp.array(dtype=scalar), cell: int, lane: int):
+            """D_m^-1 [1/m]; ``cell`` is where the cells of one place in the strips begin."""
+            value = matrix()
+            for a in range(wp.static(dim)):
+                for i in range(wp.static(dim)):
+                    value[a, i] = B[cell * wp.static(dim * dim) + (a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
+            return value
+
+        @wp.func
+        def parameters(p: wp.array(dtype=scalar), cell: int, lane: int):
+            """The material's."""
+            value = parameter_vector()
+            for i in range(wp.static(parameter_count)):
+                if wp.static(uniform):
+                    value[i] = p[i]
+                else:
+                    value[i] = p[cell * wp.static(parameter_count) + i * wp.static(CHUNK) + lane]
+            return value
+
+        self.displacement, self.gradients, self.parameters = displacement, gradients, parameters
+
+
 @functools.cache
 def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: bool) -> wp.Kernel:
     t = types(dim, dtype)
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
-    parameter_count = constitutive.parameter_count
-    parameter_vector = wp.types.vector(length=parameter_count, dtype=scalar)
     width = STRIP + dim
     strip_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
-    stress = constitutive.stress
+    stress, direct_stress = constitutive.stress, constitutive.direct_stress
+    direct = direct_stress is not None
+    read = _Readers(constitutive.parameter_count, dim, dtype, uniform)
+    read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": _compiler_flags(4)})
     def strip_force(
@@ -58,8 +102,12 @@ def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: boo
         parameters: wp.array(dtype=scalar),
         u: wp.array(dtype=vector),
         force_out: wp.array(dtype=scalar),
+        known_out: wp.array(dtype=scalar),
     ):
-        """Writes the internal forces on the points of the strips of chunk ``first + tid``."""
+        """Writes the internal forces on the points of the strips of chunk ``first + tid``.
+
+        With a direct stress, cells where it does not hold exert none, and 0 is written for them instead of 1.
+        """
         chunk = first + wp.tid()
         own_points = wp.array(ptr=strip_points.ptr, shape=(0,), dtype=wp.int32)
         B = wp.array(ptr=inverse_shape.ptr, shape=(0,), dtype=scalar)
@@ -67,30 +115,25 @@ def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: boo
         p = wp.array(ptr=parameters.ptr, shape=(0,), dtype=scalar)
         displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
         forces = wp.zeros(shape=(wp.static(width * dim * CHUNK),), dtype=scalar)
+        known = wp.zeros(shape=(wp.static(STRIP * CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
         for lane in range(wp.static(CHUNK)):
             x = strip_vectors()
             for a in range(wp.static(width)):
-                offset = own_points[(chunk * wp.static(width) + a) * wp.static(CHUNK) + lane]
-                for i in range(wp.static(dim)):
-                    x[a, i] = displacement[offset + i]
+                x[a] = read_displacement(own_points, displacement, chunk, a, lane)
             f = strip_vectors()
             for k in range(wp.static(STRIP)):
                 cell = (chunk * wp.static(STRIP) + k) * wp.static(CHUNK)
-                gradients = matrix()
+                gradients = read_gradients(B, cell, lane)
                 H = matrix()
                 for a in range(wp.static(dim)):
-                    for i in range(wp.static(dim)):
-                        gradients[a, i] = B[
-                            cell * wp.static(dim * dim) + (a * wp.static(dim) + i) * wp.static(CHUNK) + lane
-                        ]
                     H += wp.outer(x[k + 1 + a] - x[k], gradients[a])
-                own = parameter_vector()
-                for i in range(wp.static(parameter_count)):
-                    if wp.static(uniform):
-                        own[i] = p[i]
-                    else:
-                        own[i] = p[cell * wp.static(parameter_count) + i * wp.static(CHUNK) + lane]
-                weighted = -volumes[cell + lane] * stress(H, own)
+                own = read_parameters(p, cell, lane)
+                if wp.static(direct):
+                    P, holds = direct_stress(H, own)
+                    known[k * wp.static(CHUNK) + lane] = scalar(holds)
+                    weighted = -volumes[cell + lane] * select(holds == 1, P, matrix())
+                else:
+                    weighted = -volumes[cell + lane] * stress(H, own)
                 for a in range(wp.static(dim)):
                     corner = weighted * gradients[a]
                     f[k + 1 + a] += corner
@@ -101,8 +144,57 @@ def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: boo
         out = wp.array(ptr=force_out.ptr, shape=(0,), dtype=scalar)
         for entry in range(wp.static(width * dim * CHUNK)):
             out[chunk * wp.static(width * dim * CHUNK) + entry] = forces[entry]
+        if wp.static(direct):
+            for place in range(wp.static(STRIP * CHUNK)):
+                known_out[chunk * wp.static(STRIP * CHUNK) + place] = known[place]
 
     return strip_force
+
+
+@functools.cache
+def _remainder_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: bool) -> wp.Kernel:
+    t = types(dim, dtype)
+    scalar, vector, matrix = t.scalar, t.vector, t.matrix
+    width = STRIP + dim
+    stress = constitutive.stress
+    read = _Readers(constitutive.parameter_count, dim, dtype, uniform)
+    read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def remaining_force(
+        first: int,
+        strip_points: wp.array(dtype=wp.int32),
+        inverse_shape: wp.array(dtype=scalar),
+        volume: wp.array(dtype=scalar),
+        parameters: wp.array(dtype=scalar),
+        u: wp.array(dtype=vector),
+        force_out: wp.array(dtype=scalar),
+        known: wp.array(dtype=scalar),
+    ):
+        """Adds the forces of those cells of chunk ``first + tid`` that the direct stress left out, one at a time."""
+        chunk = first + wp.tid()
+        displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
+        for place in range(wp.static(STRIP * CHUNK)):
+            if known[chunk * wp.static(STRIP * CHUNK) + place] == scalar(0.0):
+                k = place // wp.static(CHUNK)
+                lane = place % wp.static(CHUNK)
+                cell = (chunk * wp.static(STRIP) + k) * wp.static(CHUNK)
+                gradients = read_gradients(inverse_shape, cell, lane)
+                origin = read_displacement(strip_points, displacement, chunk, k, lane)
+                H = matrix()
+                for a in range(wp.static(dim)):
+                    H += wp.outer(
+                        read_displacement(strip_points, displacement, chunk, k + 1 + a, lane) - origin, gradients[a]
+                    )
+                weighted = -volume[cell + lane] * stress(H, read_parameters(parameters, cell, lane))
+                start = (chunk * wp.static(width) + k) * wp.static(dim * CHUNK) + lane
+                for a in range(wp.static(dim)):
+                    corner = weighted * gradients[a]
+                    for i in range(wp.static(dim)):
+                        force_out[start + ((1 + a) * wp.static(dim) + i) * wp.static(CHUNK)] += corner[i]
+                        force_out[start + i * wp.static(CHUNK)] -= corner[i]
+
+    return remaining_force
 
 
 @functools.cache
@@ -153,6 +245,10 @@ class VectorizedForce:
         inverse_shape: D_m^-1 of each cell, (count, dim, dim) [1/m].
         volumes: (count,) [m^3].
         parameters: the material's, (1, k) if uniform, else (count, k).
+
+    Attributes:
+        known: for a material with a direct stress, 1 for each cell of the strips where it held in the last forces
+            computed, else 0.
     """
 
     def __init__(
@@ -169,7 +265,10 @@ class VectorizedForce:
         self._scalar = t.scalar
         dtype = "float32" if t.scalar is wp.float32 else "float64"
         uniform = len(parameters) == 1
-        self._force = _force_kernel(kernels.constitutive, dim, dtype, uniform)
+        made_for = (kernels.constitutive, dim, dtype, uniform)
+        self._kernels = [_force_kernel(*made_for)]
+        if kernels.constitutive.direct_stress is not None:
+            self._kernels.append(_remainder_kernel(*made_for))
         self._sum = _sum_kernel(dim, dtype)
         strips = cut_into_strips(rest_points, host_cells)
         self.chunk_count = -(-len(strips.cells) // CHUNK)
@@ -188,6 +287,8 @@ class VectorizedForce:
         width = STRIP + dim
         size = self.chunk_count * width * dim * CHUNK
         self._strip_forces = wp.zeros(size + dim * CHUNK, dtype=t.scalar, device="cpu")  # zeros at the end, for padding
+        flags = self.chunk_count * STRIP * CHUNK if len(self._kernels) == 2 else 0
+        self.known = wp.zeros(flags, dtype=t.scalar, device="cpu")
         self._list_entries(points, real, zero=size)
 
     def _blocked(self, rows: np.ndarray, dtype: type) -> wp.array:
@@ -248,14 +349,18 @@ class VectorizedForce:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [*self.arrays_by_name.values(), self._strip_forces, *self._lists]
+        return [*self.arrays_by_name.values(), self._strip_forces, self.known, *self._lists]
 
-    def record_forces(self, u: wp.array, chunks: range) -> wp.Launch | None:
-        """The launch that computes the forces of a range of chunks at the displacements ``u``; ``None`` for none."""
+    def record_forces(self, u: wp.array, chunks: range) -> list[wp.Launch]:
+        """The launches that compute the forces of a range of chunks at the displacements ``u``, in their order."""
+        if not chunks:
+            return []
         inputs = [chunks.start, *self.arrays_by_name.values(), u]
-        return wp.launch(
-            self._force, len(chunks), inputs=inputs, outputs=[self._strip_forces], device="cpu", record_cmd=True
-        )
+        outputs = [self._strip_forces, self.known]
+        return [
+            wp.launch(kernel, len(chunks), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
+            for kernel in self._kernels
+        ]
 
     def record_sums(self, force_out: wp.array, points: range) -> wp.Launch | None:
         """The launch that then adds the forces on a range of points, of whole windows, to ``force_out``.
@@ -269,5 +374,6 @@ class VectorizedForce:
 
     def add(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the internal forces at ``u`` to ``force_out``."""
-        self.record_forces(u, range(self.chunk_count)).launch()
+        for launch in self.record_forces(u, range(self.chunk_count)):
+            launch.launch()
         self.record_sums(force_out, range(len(force_out))).launch()

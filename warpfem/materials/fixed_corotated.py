@@ -13,8 +13,10 @@ from warpfem.tensor import (
     cofactor_differential,
     deformation_gradient,
     differentiable_rotation,
+    direct_rotation,
     identity_like,
     rotation_differential,
+    select,
     symmetric_part,
     volume_change,
 )
@@ -26,26 +28,33 @@ def _constitutive() -> Constitutive:
     rotation = differentiable_rotation()
 
     @wp.func
-    def rotated_strain(H: Any):
-        """F - R = R (S + I)^-1 (F^T F - I), the right side free of cancellation near rest."""
+    def strain(H: Any, R: Any):
+        """F - R; near rest as R (S + I)^-1 (F^T F - I), the right side free of cancellation."""
         F = deformation_gradient(H)
-        R = rotation(F)
-        if wp.ddot(H, H) > H.dtype(0.25):
-            return F - R
-        S = symmetric_part(wp.transpose(R) * F)
-        return R * (wp.inverse(S + identity_like(S)) * (H + wp.transpose(H) + wp.transpose(H) * H))
+        A = symmetric_part(wp.transpose(R) * F) + identity_like(H)
+        near = R * (cofactor(A) * (H + wp.transpose(H) + wp.transpose(H) * H)) * (H.dtype(1.0) / wp.determinant(A))
+        return select(wp.ddot(H, H) > H.dtype(0.25), F - R, near)
+
+    @wp.func
+    def rotated_stress(H: Any, R: Any, parameters: Any):
+        return (H.dtype(2.0) * parameters[0]) * strain(H, R) + (parameters[1] * volume_change(H)) * (
+            identity_like(H) + cofactor_change(H)
+        )
 
     @wp.func
     def energy_density(H: Any, parameters: Any):
-        strain = rotated_strain(H)
+        e = strain(H, rotation(deformation_gradient(H)))
         j = volume_change(H)
-        return parameters[0] * wp.ddot(strain, strain) + H.dtype(0.5) * parameters[1] * j * j
+        return parameters[0] * wp.ddot(e, e) + H.dtype(0.5) * parameters[1] * j * j
 
     @wp.func
     def stress(H: Any, parameters: Any):
-        return (H.dtype(2.0) * parameters[0]) * rotated_strain(H) + (parameters[1] * volume_change(H)) * (
-            identity_like(H) + cofactor_change(H)
-        )
+        return rotated_stress(H, rotation(deformation_gradient(H)), parameters)
+
+    @wp.func
+    def direct_stress(H: Any, parameters: Any):
+        R, holds = direct_rotation(deformation_gradient(H))
+        return rotated_stress(H, R, parameters), holds
 
     @wp.func
     def stress_differential(H: Any, dH: Any, parameters: Any):
@@ -57,7 +66,14 @@ def _constitutive() -> Constitutive:
             + (parameters[1] * volume_change(H)) * cofactor_differential(F, dH)
         )
 
-    return Constitutive(energy_density, stress, stress_differential, corotated=True, volumetric=VOLUME_CHANGE)
+    return Constitutive(
+        energy_density,
+        stress,
+        stress_differential,
+        corotated=True,
+        direct_stress=direct_stress,
+        volumetric=VOLUME_CHANGE,
+    )
 
 
 class FixedCorotated(HookeanMaterial):

@@ -116,7 +116,7 @@ class _Passes:
         second: list[list[wp.Launch | None]] = [[] for _ in self._points]
         for force in self._forces:
             for launches, part in zip(first, share(force.chunk_count, self._team.size), strict=True):
-                launches.append(force.record_forces(state.u, part))
+                launches.extend(force.record_forces(state.u, part))
             for launches, points in zip(second, self._points, strict=True):
                 launches.append(force.record_sums(self._force, points))
         for launches, points in zip(second, self._points, strict=True):
