@@ -18,6 +18,7 @@ from warpfem.model import Model, State
 from warpfem.moduli import Parameter
 from warpfem.scene import Body, Scene
 from warpfem.solvers import SymplecticEuler
+from warpfem.stiffness import all_blocks, pair_count
 
 IDENTITY = np.eye(3)
 LEVI_CIVITA = np.zeros((3, 3, 3))
@@ -287,10 +288,9 @@ class Samples:
     def _tangent(self, kernel: str) -> np.ndarray:
         (block,) = self.model.blocks
         n, d = len(self.F), self.dim
-        slots = np.arange(n * (d + 1) ** 2, dtype=np.int32).reshape(n, d + 1, d + 1)
-        blocks = wp.zeros(slots.size, dtype=self.model.types.matrix, device=self.model.device)
-        block.launch(kernel, [self.state.u, wp.array(slots, dtype=wp.int32, device=self.model.device)], [blocks])
-        K = blocks.numpy().astype(np.float64).reshape(n, d + 1, d + 1, d, d)
+        stored = wp.zeros(n * pair_count(d + 1), dtype=self.model.types.matrix, device=self.model.device)
+        block.launch(kernel, [self.state.u], [stored])
+        K = all_blocks(stored.numpy(), d + 1)
         return K[:, 1:, 1:].transpose(0, 3, 1, 4, 2) / self.volume  # K[j, l, i, k] couples F_ij and F_kl
 
 

@@ -236,7 +236,9 @@ def test_a_bare_scene_has_no_optional_term(monkeypatch, solver):
         assert names == {
             "unique.element_force",
             "unique.kick_drift",
-            "unique.element_stiffness",  # once, for the stability limit
+            "unique.flush_subnormals",
+            "unique.restore_subnormals",
+            "unique.element_frequency_bound",  # once, for the stability limit
             "unique.element_frequency",  # now and then, to follow it
             "unique.element_energy",  # of model.energies
             "points.kinetic_energy",

@@ -39,16 +39,25 @@ def _scene(mesh, material, **settings):
     )
 
 
-@pytest.mark.parametrize("case", ["3D, single precision, one modulus", "2D, double precision, moduli per cell"])
-def test_the_forces_are_those_of_the_plain_kernel(case):
-    if case.startswith("3D"):
-        mesh, dtype, E, limit = MESHES["box"], "float32", 1e5, 2e-6
-    else:
-        mesh, dtype, limit = MESHES["rectangle"], "float64", 1e-14
-        E = np.linspace(1e5, 1e6, mesh.cell_count)
-    model = wf.Model(_scene(mesh, wf.StableNeoHookean(E=E, nu=0.3)), device="cpu", dtype=dtype)
+@pytest.mark.parametrize(
+    ("kind", "case"),
+    [
+        (wf.StableNeoHookean, "3D, single precision, one modulus"),
+        (wf.NeoHookean, "2D, double precision, moduli per cell"),
+        *(
+            pytest.param(kind, case, marks=pytest.mark.slow)
+            for kind in (wf.LinearElasticity, wf.StVenantKirchhoff, wf.NeoHookean, wf.StableNeoHookean)
+            for case in ("3D, double precision, moduli per cell", "2D, single precision, one modulus")
+        ),
+    ],
+)
+def test_the_forces_are_those_of_the_plain_kernel(kind, case):
+    mesh = MESHES["box" if "3D" in case else "rectangle"]
+    dtype, limit = ("float32", 2e-6) if "single" in case else ("float64", 1e-14)
+    E = 1e5 if "one" in case else np.linspace(1e5, 1e6, mesh.cell_count)
+    model = wf.Model(_scene(mesh, kind(E=E, nu=0.3)), device="cpu", dtype=dtype)
     state = model.state()
-    state.assign(displacement=0.02 * np.random.default_rng(0).normal(size=mesh.points.shape))
+    state.assign(displacement=0.03 * mesh.mean_edge_length * np.random.default_rng(0).normal(size=mesh.points.shape))
     plain = model.internal_force(state)
     model.vectorize()
     assert model.blocks[0].vectorized is not None

@@ -397,6 +397,57 @@ class ElementKernels:
         return element_frequency
 
     @functools.cached_property
+    def frequency_bound(self) -> wp.Kernel:
+        """Writes (tr A^8)^(1/8) of each linear cell, of which A (d + 1)/density has the squared frequencies [1/s^2].
+
+        On the change G of H, with lumped mass: A G = dP(G) Q, Q = sum_a b_a b_a^T over the gradients of all d + 1 shape
+        functions. It has the eigenvalues of M^-1/2 K M^-1/2 of the cell but for those that are zero, so that the norm
+        is at least the largest of them, and at most rank^(1/8) of it. In float64.
+        """
+        dim = self.dim
+        scalar, vector, matrix, cell_type = self._types
+        parameter_vector = self.parameter_vector
+        displacement_gradient = self._displacement_gradient
+        stress_differential = self.constitutive.stress_differential
+        operator = wp.types.matrix(shape=(dim * dim, dim * dim), dtype=wp.float64)
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def element_frequency_bound(
+            cells: wp.array(dtype=cell_type),
+            inverse_shape: wp.array(dtype=matrix),
+            parameters: wp.array(dtype=parameter_vector),
+            u: wp.array(dtype=vector),
+            bound_out: wp.array(dtype=wp.float64),
+        ):
+            i = wp.tid()
+            B = inverse_shape[i]
+            H = displacement_gradient(u, cells[i], B)
+            first = vector()
+            Q = matrix()
+            for k in range(dim):
+                first = first + B[k]
+                Q += wp.outer(B[k], B[k])
+            Q += wp.outer(first, first)
+            A = operator()
+            count = int(dim)
+            for k in range(count):
+                axis = vector()
+                axis[k] = scalar(1.0)
+                for j in range(count):
+                    dP = stress_differential(H, wp.outer(axis, Q[j]), parameters[i])
+                    for m in range(dim):
+                        for n in range(dim):
+                            A[dim * m + n, dim * k + j] = wp.float64(dP[m, n])
+            size = wp.sqrt(wp.ddot(A, A))
+            if size > wp.float64(0.0):
+                A = A / size
+            A = A * A
+            A = A * A
+            bound_out[i] = size * wp.pow(wp.ddot(A, wp.transpose(A)), wp.float64(0.125))
+
+        return element_frequency_bound
+
+    @functools.cached_property
     def step_limit(self) -> wp.Kernel:
         """Lowers ``limit_out[0]`` to the least s > 0 at which u + s p takes a cell to J = 0.
 

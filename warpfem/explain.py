@@ -108,13 +108,14 @@ def explain(scene: Scene, *, device: str | None = None, dtype: FloatName = "floa
         stability = "no stability limit" if limit is None else f"stable below {limit:.4g} s at rest"
         dt = f"dt = {simulation.dt:.4g} s, {simulation.steps_per_frame} steps per frame, {stability}"
     linear = [f"linear systems: {stepper.linear_solver}"] if stepper.linear_solver else []
+    forces = [f"forces: {stepper.forces}"] if stepper.forces else []
     bodies = f"{len(scene.bodies)} bodies" if len(scene.bodies) > 1 else "1 body"
     return Explanation(
         headline=(
             f"{scene.dim}D, {bodies}, {model.point_count} points, {model.cell_count} cells, "
             f"{model.dtype} on {model.device}"
         ),
-        stepping="\n".join([repr(simulation.solver), dt, *linear]),
+        stepping="\n".join([repr(simulation.solver), dt, *linear, *forces]),
         terms=_terms(simulation),
         kernels=list(seen.kernels.values()),
         other_kernels=[use for key, use in set_up.kernels.items() if key not in seen.kernels],

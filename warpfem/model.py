@@ -21,7 +21,7 @@ from warpfem.mesh import Mesh
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
-from warpfem.stiffness import pair_count, pair_index
+from warpfem.stiffness import all_blocks, pair_count
 from warpfem.threads import available_threads
 
 if TYPE_CHECKING:
@@ -211,6 +211,7 @@ class CellBlock:
 
     def vectorize(self, rest_points: np.ndarray) -> None:
         """Prepares the force of several cells at a time, where that is possible and pays."""
+        # a GPU has lanes of its own, and adds to points by atomics, which it does well
         possible = self.device.is_cpu and self.shape.order == 1 and not self.averaged
         if self.vectorized or not possible or not self.kernels.constitutive.branchless or self.count < VECTORIZED_CELLS:
             return
@@ -368,12 +369,14 @@ class Model:
         # from each cell's own stiffness: the uniform stretch u = X_x e_x has the energy V/2 d²psi/dF_xx²
         modulus = np.zeros(self.cell_count)
         rest, volume = self.rest_points, np.concatenate([body.mesh.cell_volumes for body in bodies])
-        for block, part, stiffness in self.element_stiffness_parts():
-            stretch = np.zeros(stiffness.shape[:3])
-            points = rest[block.host_cells[part], 0]
-            stretch[..., 0] = points - points[:, :1]
-            work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
-            modulus[block.index[part]] = work / volume[block.index[part]]
+        u = self.zeros()
+        for block in self.blocks:
+            for part, stiffness in self.element_stiffness_parts(block, u):
+                stretch = np.zeros(stiffness.shape[:3])
+                points = rest[block.host_cells[part], 0]
+                stretch[..., 0] = points - points[:, :1]
+                work = np.einsum("cai,caibj,cbj->c", stretch, stiffness, stretch)
+                modulus[block.index[part]] = work / volume[block.index[part]]
         return [float(modulus[cells].max()) for _, cells in self.body_slices]
 
     def _slip_speed(self) -> float:
@@ -548,33 +551,28 @@ class Model:
             indexed by point and component of the force, then of the displacement. That of an averaged cell is what
             it would have if its volume change were its own: the whole has less than the sum.
         """
-        parts: dict[CellBlock, list[np.ndarray]] = {block: [] for block in self.blocks}
-        for block, _, stiffness in self.element_stiffness_parts(u):
-            parts[block].append(stiffness)
-        return [np.concatenate(own) for own in parts.values()]
-
-    def element_stiffness_parts(self, u: wp.array | None = None) -> Iterator[tuple[CellBlock, slice, np.ndarray]]:
-        """:meth:`element_stiffness` a part of the cells at a time, which takes little memory.
-
-        Yields:
-            The block, the range of its cells, and their stiffness.
-        """
         if u is None:
             u = self.zeros()
+        return [
+            np.concatenate([stiffness for _, stiffness in self.element_stiffness_parts(block, u)])
+            for block in self.blocks
+        ]
+
+    def element_stiffness_parts(self, block: CellBlock, u: wp.array) -> Iterator[tuple[slice, np.ndarray]]:
+        """:meth:`element_stiffness` of a block a part of the cells at a time, which takes little memory.
+
+        Yields:
+            The range of the cells in the block, and their stiffness.
+        """
         d = self.dim
-        for block in self.blocks:
-            corners = block.shape.point_count
-            most = STIFFNESS_PART * (d + 1) ** 2 // corners**2
-            for start in range(0, block.count, most):
-                part = slice(start, min(start + most, block.count))
-                count = part.stop - start
-                pairs = pair_index(corners)
-                values = wp.empty(count * pair_count(corners), dtype=self.types.matrix, device=self.device)
-                block.launch("stiffness", [u], [values], part=part, kernels=block.bounding_kernels)
-                entries = values.numpy().astype(np.float64).reshape(count, -1, d, d)[:, pairs]
-                lower = np.tril_indices(corners, -1)
-                entries[:, lower[0], lower[1]] = entries[:, lower[0], lower[1]].swapaxes(-2, -1)
-                yield block, part, entries.transpose(0, 1, 3, 2, 4)
+        corners = block.shape.point_count
+        most = STIFFNESS_PART * (d + 1) ** 2 // corners**2
+        for start in range(0, block.count, most):
+            part = slice(start, min(start + most, block.count))
+            count = part.stop - start
+            values = wp.empty(count * pair_count(corners), dtype=self.types.matrix, device=self.device)
+            block.launch("stiffness", [u], [values], part=part, kernels=block.bounding_kernels)
+            yield part, all_blocks(values.numpy(), corners).transpose(0, 1, 3, 2, 4)
 
     def stresses(self, state: State) -> Stresses:
         """Deformation gradients and stresses at every quadrature point: one per linear cell, dim + 1 per quadratic."""

@@ -31,7 +31,7 @@ def record(
     resume: bool = False,
     recipe: str = "",
 ) -> Generator[Frame, None, None]:
-    """Runs a simulation and stores each frame in the USD file ``path`` before it is yielded.
+    """Runs a simulation and stores each frame in the USD file ``path`` while the next one is computed.
 
     If the run fails, is interrupted or the caller stops, the file holds the frames so far. A file that exists is
     overwritten, and so are the partial file, the checkpoint and the failed state that an earlier run of the same
@@ -52,7 +52,7 @@ def record(
             before the first step where that can be known, and then nothing has been changed.
         SimulationError: the run cannot go on; the frames so far are in the file.
     """
-    from warpfem.usd import UsdWriter
+    from warpfem.usd import BackgroundWriter, UsdWriter
 
     if checkpoint_every is not None and not (isinstance(checkpoint_every, int) and checkpoint_every >= 1):
         raise OutputError(f"checkpoint_every must be a number of frames of at least 1, not {checkpoint_every!r}")
@@ -68,7 +68,7 @@ def record(
         start.require_fit(simulation, parts, checkpoint_file)
         frame = simulation.restore(start.frame, start.time, start.displacement, start.velocity)
         keep = start.frame, body_frames(simulation.model, frame)
-    with UsdWriter(
+    usd_writer = UsdWriter(
         path,
         usd_bodies(scene),
         fps=scene.fps,
@@ -78,7 +78,8 @@ def record(
         comment=f"warpfem {__version__}",
         keep=keep,
         expected_frames=scene.frames + 1,
-    ) as writer:
+    )
+    with BackgroundWriter(usd_writer) as writer:
         _remove(failure_file)
         if start is None:
             _remove(checkpoint_file)
@@ -152,7 +153,7 @@ def usd_bodies(scene: Scene) -> list[UsdBody]:
 
 
 def body_frames(model: Model, frame: Frame) -> list[BodyFrame]:
-    """What the USD writer takes of a frame."""
+    """What the USD writer takes of a frame, in arrays of its own."""
     from warpfem.usd import BodyFrame
 
     x = model.rest_points + frame.displacement
@@ -160,7 +161,7 @@ def body_frames(model: Model, frame: Frame) -> list[BodyFrame]:
     for body, (points, cells) in zip(model.scene.bodies, model.body_slices, strict=True):
         parts = len(body.mesh.shape.parts)
         von_mises, jacobian = (np.repeat(values[cells], parts) for values in (frame.von_mises, frame.jacobian))
-        frames.append(BodyFrame(x[points], frame.velocity[points], von_mises, jacobian))
+        frames.append(BodyFrame(x[points], frame.velocity[points].copy(), von_mises, jacobian))
     return frames
 
 

@@ -26,6 +26,15 @@ def pair_index(point_count: int) -> np.ndarray:
     return index
 
 
+def all_blocks(stored: np.ndarray, point_count: int) -> np.ndarray:
+    """The blocks K_ab of cells of that many points, (count, k, k, d, d) float64, from those that are stored."""
+    dim = stored.shape[-1]
+    blocks = stored.astype(np.float64).reshape(-1, pair_count(point_count), dim, dim)[:, pair_index(point_count)]
+    rows, columns = np.tril_indices(point_count, -1)
+    blocks[:, rows, columns] = blocks[:, rows, columns].swapaxes(-2, -1)
+    return blocks
+
+
 @wp.func
 def _put(entries: wp.array(dtype=Any), slot: int, block: Any, place: int):
     """Adds a block to the sum over the quadrature points, which begins with the first."""

@@ -4,6 +4,7 @@ H is the displacement gradient, F = I + H the deformation gradient, J = det F. T
 cancellation that the textbook forms in F suffer near rest (Shakeri, Brown et al. 2024).
 """
 
+import functools
 from typing import Any
 
 import warp as wp
@@ -124,6 +125,22 @@ def cofactor_change(H: mat33):  # noqa: F811
 
 
 @wp.func
+def _atanh_series(w: Any):
+    """(atanh z - z) / z^3 for w = z^2 < 0.032."""
+    one = type(w)(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
+    series = one / type(w)(19.0)
+    series = series * w + one / type(w)(17.0)
+    series = series * w + one / type(w)(15.0)
+    series = series * w + one / type(w)(13.0)
+    series = series * w + one / type(w)(11.0)
+    series = series * w + one / type(w)(9.0)
+    series = series * w + one / type(w)(7.0)
+    series = series * w + one / type(w)(5.0)
+    series = series * w + one / type(w)(3.0)
+    return series
+
+
+@wp.func
 def log1p_deficit(y: Any):
     """y - ln(1 + y) without cancellation; NaN for y < -1.
 
@@ -133,43 +150,48 @@ def log1p_deficit(y: Any):
         return y - wp.log(type(y)(1.0) + y)
     z = y / (type(y)(2.0) + y)
     w = z * z
-    one = type(y)(1.0)  # Warp would divide literals, 1.0 / 17.0, in float32
-    series = one / type(y)(19.0)
-    series = series * w + one / type(y)(17.0)
-    series = series * w + one / type(y)(15.0)
-    series = series * w + one / type(y)(13.0)
-    series = series * w + one / type(y)(11.0)
-    series = series * w + one / type(y)(9.0)
-    series = series * w + one / type(y)(7.0)
-    series = series * w + one / type(y)(5.0)
-    series = series * w + one / type(y)(3.0)
-    return y * z - type(y)(2.0) * z * w * series
-
-
-@wp.func
-def log1p(y: Any):
-    """ln(1 + y), accurate for small y; NaN for y < -1."""
-    if wp.abs(y) > type(y)(0.3):
-        return wp.log(type(y)(1.0) + y)
-    return y - log1p_deficit(y)
+    return y * z - type(y)(2.0) * z * w * _atanh_series(w)
 
 
 @wp.func
 def volume_ratio(H: Any):
     """J = det(I + H): from J - 1 near rest, from F under compression, where J - 1 would keep no digits of J."""
     j = volume_change(H)
-    if j < H.dtype(-0.5):
-        return wp.determinant(deformation_gradient(H))
-    return H.dtype(1.0) + j
+    return wp.where(j < H.dtype(-0.5), wp.determinant(deformation_gradient(H)), H.dtype(1.0) + j)
+
+
+@wp.func
+def _binary_exponent(x: wp.float32):
+    """The power e of 2 that brings x > 0 to [sqrt(1/2), sqrt(2)], and 2^-e."""
+    e = (wp.cast(x, wp.int32) - 0x3F3504F3) >> 23
+    return wp.float32(e), wp.cast((127 - e) << 23, wp.float32)
+
+
+@wp.func
+def _binary_exponent(x: wp.float64):
+    e = (wp.cast(x, wp.int64) - wp.int64(0x3FE6A09E667F3BCD)) >> wp.int64(52)
+    return wp.float64(e), wp.cast((wp.int64(1023) - e) << wp.int64(52), wp.float64)
 
 
 @wp.func
 def log_volume_ratio(H: Any):
-    """ln J, accurate near rest and under compression; not a number for J < 0."""
+    """ln J, accurate near rest and under compression; not a number for J <= 0.
+
+    With J = 2^e (1 + y), ln J = e ln 2 + 2 atanh z, z = y / (2 + y), |z| < 0.18: without branches or calls, so that the
+    compiler can take several at a time.
+    """
+    one = H.dtype(1.0)
     j = volume_change(H)
-    if j < H.dtype(-0.5):
-        return wp.log(wp.determinant(deformation_gradient(H)))
-    return log1p(j)
+    J = volume_ratio(H)
+    e, scale = _binary_exponent(J)
+    near = wp.abs(j) < H.dtype(0.3)
+    y = wp.where(near, j, J * scale - one)
+    z = y / (H.dtype(2.0) + y)
+    w = z * z
+    value = wp.where(near, H.dtype(0.0), e) * H.dtype(0.6931471805599453) + H.dtype(2.0) * z * (
+        one + w * _atanh_series(w)
+    )
+    return wp.where(J > H.dtype(0.0), value, H.dtype(wp.nan))
 
 
 @wp.func
@@ -446,13 +468,21 @@ def rotation_differential(F: mat33, G: mat33):  # noqa: F811
     return R * skew(_rotation_rate(R, F, G))
 
 
-for _matrix in (wp.mat22f, wp.mat22d, wp.mat33f, wp.mat33d):
+@functools.cache
+def differentiable_rotation() -> wp.Function:
+    """:func:`polar_rotation` with the exact derivative for Warp's reverse mode.
 
-    @wp.func
-    def rotation(F: _matrix):
-        """:func:`polar_rotation` with the exact derivative for Warp's reverse mode."""
-        return polar_rotation(F)
+    Made when first asked for: to attach a derivative, Warp analyses all that the function calls, which takes as long
+    as to import the rest of this package.
+    """
+    for matrix in (wp.mat22f, wp.mat22d, wp.mat33f, wp.mat33d):
 
-    @wp.func_grad(rotation)
-    def _adjoint_rotation(F: _matrix, adjoint: _matrix):
-        wp.adjoint[F] += rotation_differential(F, adjoint)  # dR/dF is symmetric
+        @wp.func
+        def rotation(F: matrix):
+            return polar_rotation(F)
+
+        @wp.func_grad(rotation)
+        def adjoint_rotation(F: matrix, adjoint: matrix):
+            wp.adjoint[F] += rotation_differential(F, adjoint)  # dR/dF is symmetric
+
+    return rotation

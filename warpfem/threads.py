@@ -41,15 +41,15 @@ class Team:
         others = jobs[1:]
         for inbox, job in zip(self._inboxes, others, strict=False):
             inbox.put(job)
-        failures: list[BaseException | None] = []
+        outcomes: list[BaseException | None] = []
         try:
             jobs[0]()
         except BaseException as failure:
-            failures.append(failure)
-        failures += [self._outbox.get() for _ in others]
-        for failure in failures:
-            if failure is not None:
-                raise failure
+            outcomes.append(failure)
+        outcomes += [self._outbox.get() for _ in others]
+        for outcome in outcomes:
+            if outcome is not None:
+                raise outcome
 
     def __del__(self) -> None:
         for inbox in self._inboxes:

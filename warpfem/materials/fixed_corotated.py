@@ -1,5 +1,6 @@
 """The fixed corotated material."""
 
+import functools
 from typing import Any
 
 import warp as wp
@@ -11,48 +12,52 @@ from warpfem.tensor import (
     cofactor_change,
     cofactor_differential,
     deformation_gradient,
+    differentiable_rotation,
     identity_like,
-    rotation,
     rotation_differential,
     symmetric_part,
     volume_change,
 )
 
 
-@wp.func
-def rotated_strain(H: Any):
-    """F - R = R (S + I)^-1 (F^T F - I), the right side free of cancellation near rest."""
-    F = deformation_gradient(H)
-    R = rotation(F)
-    if wp.ddot(H, H) > H.dtype(0.25):
-        return F - R
-    S = symmetric_part(wp.transpose(R) * F)
-    return R * (wp.inverse(S + identity_like(S)) * (H + wp.transpose(H) + wp.transpose(H) * H))
+@functools.cache
+def _constitutive() -> Constitutive:
+    """The kernel functions, made when first asked for, as the rotation is."""
+    rotation = differentiable_rotation()
 
+    @wp.func
+    def rotated_strain(H: Any):
+        """F - R = R (S + I)^-1 (F^T F - I), the right side free of cancellation near rest."""
+        F = deformation_gradient(H)
+        R = rotation(F)
+        if wp.ddot(H, H) > H.dtype(0.25):
+            return F - R
+        S = symmetric_part(wp.transpose(R) * F)
+        return R * (wp.inverse(S + identity_like(S)) * (H + wp.transpose(H) + wp.transpose(H) * H))
 
-@wp.func
-def energy_density(H: Any, parameters: Any):
-    strain = rotated_strain(H)
-    j = volume_change(H)
-    return parameters[0] * wp.ddot(strain, strain) + H.dtype(0.5) * parameters[1] * j * j
+    @wp.func
+    def energy_density(H: Any, parameters: Any):
+        strain = rotated_strain(H)
+        j = volume_change(H)
+        return parameters[0] * wp.ddot(strain, strain) + H.dtype(0.5) * parameters[1] * j * j
 
+    @wp.func
+    def stress(H: Any, parameters: Any):
+        return (H.dtype(2.0) * parameters[0]) * rotated_strain(H) + (parameters[1] * volume_change(H)) * (
+            identity_like(H) + cofactor_change(H)
+        )
 
-@wp.func
-def stress(H: Any, parameters: Any):
-    return (H.dtype(2.0) * parameters[0]) * rotated_strain(H) + (parameters[1] * volume_change(H)) * (
-        identity_like(H) + cofactor_change(H)
-    )
+    @wp.func
+    def stress_differential(H: Any, dH: Any, parameters: Any):
+        F = deformation_gradient(H)
+        C = cofactor(F)
+        return (
+            (H.dtype(2.0) * parameters[0]) * (dH - rotation_differential(F, dH))
+            + (parameters[1] * wp.ddot(C, dH)) * C
+            + (parameters[1] * volume_change(H)) * cofactor_differential(F, dH)
+        )
 
-
-@wp.func
-def stress_differential(H: Any, dH: Any, parameters: Any):
-    F = deformation_gradient(H)
-    C = cofactor(F)
-    return (
-        (H.dtype(2.0) * parameters[0]) * (dH - rotation_differential(F, dH))
-        + (parameters[1] * wp.ddot(C, dH)) * C
-        + (parameters[1] * volume_change(H)) * cofactor_differential(F, dH)
-    )
+    return Constitutive(energy_density, stress, stress_differential, corotated=True, volumetric=VOLUME_CHANGE)
 
 
 class FixedCorotated(HookeanMaterial):
@@ -66,4 +71,7 @@ class FixedCorotated(HookeanMaterial):
 
     name = "fixed_corotated"
     least_nu = 0.0
-    functions = Constitutive(energy_density, stress, stress_differential, corotated=True, volumetric=VOLUME_CHANGE)
+
+    @property
+    def constitutive(self) -> Constitutive:
+        return _constitutive()

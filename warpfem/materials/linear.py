@@ -35,5 +35,12 @@ class LinearElasticity(HookeanMaterial):
 
     name = "linear"
     functions = Constitutive(
-        energy_density, stress, stress_differential, isotropic=False, convex=True, small_strain=True, volumetric=TRACE
+        energy_density,
+        stress,
+        stress_differential,
+        isotropic=False,
+        convex=True,
+        small_strain=True,
+        branchless=True,
+        volumetric=TRACE,
     )

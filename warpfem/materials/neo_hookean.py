@@ -62,4 +62,6 @@ class NeoHookean(HookeanMaterial):
 
     name = "neo_hookean"
     least_nu = 0.0
-    functions = Constitutive(energy_density, stress, stress_differential, barrier=True, volumetric=LOG_VOLUME_RATIO)
+    functions = Constitutive(
+        energy_density, stress, stress_differential, barrier=True, branchless=True, volumetric=LOG_VOLUME_RATIO
+    )

@@ -51,4 +51,4 @@ class StVenantKirchhoff(HookeanMaterial):
 
     name = "st_venant_kirchhoff"
     resists_mirroring = False
-    functions = Constitutive(energy_density, stress, stress_differential, volumetric=GREEN_TRACE)
+    functions = Constitutive(energy_density, stress, stress_differential, branchless=True, volumetric=GREEN_TRACE)

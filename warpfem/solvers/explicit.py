@@ -2,7 +2,9 @@
 
 import functools
 import math
+from abc import abstractmethod
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,14 +13,15 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.errors import SimulationError, TimeStepError
 from warpfem.model import Model, State
-from warpfem.points import CHUNK, chunks
+from warpfem.points import CHUNK
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, worst_cell
 from warpfem.solvers.stability import Watch, largest_frequency
+from warpfem.strips import STRIP
 from warpfem.subnormals import SubnormalsFlushed
 from warpfem.threads import Job, Team, share
 from warpfem.vectorized import WINDOW
 
-TRACKING_INTERVALS = (16, 256)
+TRACKING_INTERVALS = (16, 1024)
 """Bounds of the steps after which the stability limit is estimated again, at the cost of some six steps: the fewer
 cells, the sooner a wave has crossed them, and the less it matters."""
 
@@ -41,6 +44,7 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
     def kick_drift(
         first: int,
         last: int,
+        points_per_task: int,
         force: wp.array(dtype=vector),
         inverse_mass: wp.array(dtype=scalar),
         decay: scalar,
@@ -51,14 +55,14 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
         v_out: wp.array(dtype=vector),
         alarm_out: wp.array(dtype=wp.int32),
     ):
-        """v = decay v + kick f / m, then u += drift v of ``CHUNK`` points; an alarm where |v| is not below a limit."""
-        start = first + wp.tid() * CHUNK
+        """v = decay v + kick f / m, then u += drift v of some points; an alarm where |v| is not below a limit."""
+        start = first + wp.tid() * points_per_task
         forces = wp.array(ptr=force.ptr, shape=(0,), dtype=vector)  # views with a stride known at compile time, which
         inverse = wp.array(ptr=inverse_mass.ptr, shape=(0,), dtype=scalar)  # spare a multiplication at each access
         u = wp.array(ptr=u_out.ptr, shape=(0,), dtype=vector)
         v = wp.array(ptr=v_out.ptr, shape=(0,), dtype=vector)
         slow = int(1)
-        for i in range(start, wp.min(start + CHUNK, last)):
+        for i in range(start, wp.min(start + points_per_task, last)):
             velocity = decay * v[i] + (kick * inverse[i]) * forces[i]
             v[i] = velocity
             u[i] = u[i] + drift * velocity
@@ -84,6 +88,10 @@ class _Passes:
         self._points = share(model.point_count, self._team.size, WINDOW)
         self._recorded: dict[tuple, tuple[list[Job], list[Job]]] = {}
 
+    @property
+    def thread_count(self) -> int:
+        return self._team.size
+
     def run(self, state: State, *settings: float) -> None:
         key = (state.u.ptr, state.v.ptr, *settings)
         if key not in self._recorded:
@@ -103,18 +111,21 @@ class _Passes:
                 launches.append(force.record_sums(self._force, points))
         for launches, points in zip(second, self._points, strict=True):
             launches.append(self._kick_drift(state, points, *settings, record=True))
-        return [_job(own) for own in first], [_job(own) for own in second]
+        return _jobs(first), _jobs(second)
 
 
-def _job(launches: list[wp.Launch]) -> Job:
-    flushed = SubnormalsFlushed()
+def _jobs(launches: list[list[wp.Launch]]) -> list[Job]:
+    """A job of launches for each thread; threads other than the calling one flush subnormal numbers by themselves."""
 
-    def launch() -> None:
-        with flushed:
-            for own in launches:
-                own.launch()
+    def job(own: list[wp.Launch], flushed: AbstractContextManager) -> Job:
+        def launch() -> None:
+            with flushed:
+                for each in own:
+                    each.launch()
 
-    return launch
+        return launch
+
+    return [job(own, SubnormalsFlushed() if thread else nullcontext()) for thread, own in enumerate(launches)]
 
 
 class _ExplicitStepper(Stepper):
@@ -124,6 +135,7 @@ class _ExplicitStepper(Stepper):
         self._kernel = _kick_drift_kernel(model.dim, model.dtype)
         self._force = model.zeros()
         self._rough = model.contact is not None and model.contact.rough
+        self._rest_frequency: float | None = None
         self._limit: float | None = None
         self._watch: Watch | None = None
         self._watched_speed = 0.0
@@ -135,13 +147,35 @@ class _ExplicitStepper(Stepper):
         self._passes: _Passes | None = None
         if all(block.vectorized for block in model.blocks):
             self._passes = _Passes(model, self._launch_kick_drift, self._force)
+        self.forces = self._describe_forces()
+        self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
+
+    def step(self, state: State, dt: float) -> StepReport:
+        with self._flushed:
+            self._take_step(state, dt)
+        return StepReport()
+
+    @abstractmethod
+    def _take_step(self, state: State, dt: float) -> None: ...
+
+    def _describe_forces(self) -> str:
+        count = sum(block.count for block in self.model.blocks if block.vectorized)
+        if not count:
+            return "one cell at a time, on one thread"
+        plain = self.model.cell_count - count
+        size = 1 if self._passes is None else self._passes.thread_count
+        others = f", {plain} others one at a time" if plain else ""
+        threads = "1 thread" if size == 1 else f"{size} threads"
+        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
 
     def arrays(self) -> list[wp.array]:
         return [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]
 
     def stable_dt(self, state: State | None = None) -> float:
-        frequency = largest_frequency(self.model)
-        if state is not None:
+        if self._rest_frequency is None:
+            self._rest_frequency = largest_frequency(self.model)
+        frequency = self._rest_frequency
+        if state is not None and state.u.numpy().any():
             frequency = np.maximum(frequency, largest_frequency(self.model, state.u))  # not a number stays
         if state is not None and not np.isfinite(frequency):
             raise SimulationError(
@@ -221,10 +255,21 @@ class _ExplicitStepper(Stepper):
     def _launch_kick_drift(
         self, state: State, points: range, decay: float, kick: float, drift: float, speed: float, record: bool = False
     ) -> wp.Launch | None:
+        per_task = CHUNK if self.model.device.is_cpu else 1  # a GPU has a thread for each
         return wp.launch(
             self._kernel,
-            chunks(len(points)),
-            inputs=[points.start, points.stop, self._force, self.model.inverse_mass, decay, kick, drift, speed],
+            -(-len(points) // per_task),
+            inputs=[
+                points.start,
+                points.stop,
+                per_task,
+                self._force,
+                self.model.inverse_mass,
+                decay,
+                kick,
+                drift,
+                speed,
+            ],
             outputs=[state.u, state.v, self._alarm],
             device=self.model.device,
             record_cmd=record,
@@ -245,7 +290,7 @@ class _ExplicitStepper(Stepper):
 
 
 class _SymplecticEulerStepper(_ExplicitStepper):
-    def step(self, state: State, dt: float) -> StepReport:
+    def _take_step(self, state: State, dt: float) -> None:
         self._begin(state, dt)
         if self._rough:  # friction acts between the new velocity and the drift
             self._evaluate(state, dt, 0.0)
@@ -257,7 +302,6 @@ class _SymplecticEulerStepper(_ExplicitStepper):
         state.time += dt
         state.revision += 1
         self._look(state, dt)
-        return StepReport()
 
 
 class _VelocityVerletStepper(_ExplicitStepper):
@@ -265,7 +309,7 @@ class _VelocityVerletStepper(_ExplicitStepper):
         super().__init__(model)
         self._known: tuple[State, int] | None = None  # state and revision that the force belongs to
 
-    def step(self, state: State, dt: float) -> StepReport:
+    def _take_step(self, state: State, dt: float) -> None:
         self._begin(state, dt)
         if self._known is None or self._known[0] is not state or self._known[1] != state.revision:
             self._evaluate(state)
@@ -284,7 +328,6 @@ class _VelocityVerletStepper(_ExplicitStepper):
         state.revision += 1
         self._known = (state, state.revision)
         self._look(state, dt)
-        return StepReport()
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,12 @@
 """Animations and meshes in USD: the only part of warpfem that imports ``pxr``.
 
-:class:`UsdWriter` stores a run frame by frame, :func:`read_animation` reads it back, and
-:func:`read_tet_mesh` and :func:`read_surface_mesh` take meshes from files that others made. All of them
-speak numpy; none knows of Warp, models or solvers.
+:class:`UsdWriter` stores a run frame by frame, in a thread as a :class:`BackgroundWriter`;
+:func:`read_animation` reads it back, and :func:`read_tet_mesh` and :func:`read_surface_mesh` take meshes
+from files that others made. All of them speak numpy; none knows of Warp, models or solvers.
 """
 
 from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_animation
+from warpfem.usd.background import BackgroundWriter
 from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
@@ -16,6 +17,7 @@ __all__ = [
     "AnimatedBody",
     "AnimatedFrame",
     "Animation",
+    "BackgroundWriter",
     "BodyFrame",
     "ColorQuantity",
     "ColorScale",

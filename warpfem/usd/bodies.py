@@ -65,6 +65,8 @@ class BodyFrame:
 def in_space(vectors: np.ndarray) -> np.ndarray:
     """(n, 3) float64 of (n, 2 or 3) vectors: 2D lies in the plane z = 0."""
     vectors = np.asarray(vectors, np.float64)
+    if vectors.shape[1] == 3:
+        return vectors
     return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
 
 
@@ -80,8 +82,8 @@ def as_float32(where: str, values: np.ndarray) -> np.ndarray:
     """
     with np.errstate(over="ignore"):
         single = np.ascontiguousarray(values, np.float32)
-    bad = np.flatnonzero(~np.isfinite(single.reshape(len(single), -1)).all(axis=1))
-    if len(bad):
+    if not np.isfinite(single).all():
+        bad = np.flatnonzero(~np.isfinite(single.reshape(len(single), -1)).all(axis=1))
         raise OutputError(
             f"{where}: {len(bad)} of {len(single)} are not finite in float32, the first one is {bad[0]}: "
             f"{values[bad[0]]}; the run has diverged before this frame"
@@ -95,7 +97,8 @@ class CellAverage:
     def __init__(self, rest_points: np.ndarray, cells: np.ndarray) -> None:
         corners = rest_points[cells]
         self._volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
-        self._cells = cells
+        self._corners = cells.shape[1]
+        self._slots = cells.ravel().astype(np.intp)  # as np.bincount would convert them each time
         self._count = len(rest_points)
         self._weights = np.maximum(self._sum(self._volumes), np.finfo(float).tiny)
 
@@ -104,8 +107,7 @@ class CellAverage:
         return (self._sum(self._volumes * values) / self._weights).astype(np.float32)
 
     def _sum(self, values: np.ndarray) -> np.ndarray:
-        corners = self._cells.shape[1]
-        return np.bincount(self._cells.ravel(), np.repeat(values, corners), minlength=self._count)
+        return np.bincount(self._slots, np.repeat(values, self._corners), minlength=self._count)
 
 
 def cells_of_faces(body: UsdBody) -> np.ndarray:

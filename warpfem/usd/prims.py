@@ -95,7 +95,8 @@ def set_topology(mesh: UsdGeom.Mesh, faces: Iterable[np.ndarray]) -> None:
 
 def extent_of(points: np.ndarray) -> Vt.Vec3fArray:
     """The bounds of (n, 3) float32 points."""
-    return Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))
+    bounds = [(axis.min(), axis.max()) for axis in points.T]  # axis=0 of all three takes ten times as long
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(np.transpose(bounds)))
 
 
 def surface_name(body: str) -> str:
