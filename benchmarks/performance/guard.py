@@ -42,7 +42,7 @@ def measured() -> dict[str, float]:
 
     def stepping(solver: wf.solvers.Solver, dt: float) -> Callable[[], object]:
         scene = wf.Scene([body], solver, gravity=(0.0, -9.81, 0.0), dt=dt, fps=1.0 / dt, frames=1)
-        simulation = Simulation(scene)
+        simulation = Simulation(scene, threads=1)
         return lambda: simulation.stepper.step(simulation.state, dt)
 
     model = Model(wf.Scene([body], wf.BackwardEuler()))

@@ -57,7 +57,9 @@ inline V largest(V a, float b) {
 }
 inline float root(float a) { return std::sqrt(a); }
 inline Lanes<8>::Float root(Lanes<8>::Float a) { return Lanes<8>::Float(_mm256_sqrt_ps(__m256(a))); }
+#ifdef __AVX512F__
 inline Lanes<16>::Float root(Lanes<16>::Float a) { return Lanes<16>::Float(_mm512_sqrt_ps(__m512(a))); }
+#endif
 
 inline float logarithm_of_ratio(float j) { return std::log1p(j); }
 
@@ -245,6 +247,7 @@ inline void load_points(const Four* x, const int32_t* index, V out[3]) {
         out[0] = (V)_mm256_shuffle_ps(t0, t2, 0x44);
         out[1] = (V)_mm256_shuffle_ps(t0, t2, 0xee);
         out[2] = (V)_mm256_shuffle_ps(t1, t3, 0x44);
+#ifdef __AVX512F__
     } else {
         __m512 z[4];
         for (int q = 0; q < 4; q++) {
@@ -258,6 +261,7 @@ inline void load_points(const Four* x, const int32_t* index, V out[3]) {
         out[0] = (V)_mm512_shuffle_ps(t0, t2, 0x44);
         out[1] = (V)_mm512_shuffle_ps(t0, t2, 0xee);
         out[2] = (V)_mm512_shuffle_ps(t1, t3, 0x44);
+#endif
     }
 }
 
@@ -276,6 +280,7 @@ inline void to_points(const V in[3], Four* out) {
             out[q] = (Four)_mm256_castps256_ps128(p[q]);
             out[4 + q] = (Four)_mm256_extractf128_ps(p[q], 1);
         }
+#ifdef __AVX512F__
     } else {
         __m512 x = (__m512)in[0], y = (__m512)in[1], z = (__m512)in[2], w = _mm512_setzero_ps();
         __m512 t0 = _mm512_unpacklo_ps(x, y), t1 = _mm512_unpackhi_ps(x, y);
@@ -288,6 +293,7 @@ inline void to_points(const V in[3], Four* out) {
             out[8 + q] = (Four)_mm512_extractf32x4_ps(p[q], 2);
             out[12 + q] = (Four)_mm512_extractf32x4_ps(p[q], 3);
         }
+#endif
     }
 }
 
@@ -612,10 +618,16 @@ void sums(const Mesh& mesh, const Run& run) {
 template <typename Material>
 bool choose(const std::string& variant, const Mesh& mesh, const Run& run) {
     std::map<std::string, void (*)(const Mesh&, const Run&)> variants = {
-        {"scalar", strips<Material, 1, 1>},     {"lanes8", strips<Material, 1, 8>},
-        {"lanes16", strips<Material, 1, 16>},   {"strips3x8", strips<Material, 3, 8>},
-        {"strips3x16", strips<Material, 3, 16>}, {"sums8", sums<Material, 1, 8>},
-        {"sums16", sums<Material, 1, 16>},      {"sums3x8", sums<Material, 3, 8>},
+        {"scalar", strips<Material, 1, 1>},
+        {"lanes8", strips<Material, 1, 8>},
+        {"strips3x8", strips<Material, 3, 8>},
+        {"sums8", sums<Material, 1, 8>},
+        {"sums3x8", sums<Material, 3, 8>},
+#ifdef __AVX512F__
+        {"lanes16", strips<Material, 1, 16>},
+        {"strips3x16", strips<Material, 3, 16>},
+        {"sums16", sums<Material, 1, 16>},
+#endif
     };
     auto found = variants.find(variant);
     if (found == variants.end()) return false;

@@ -4,7 +4,6 @@ import json
 import os
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
@@ -166,13 +165,14 @@ def take_turns(
                 outcomes[i].missing = str(error)
                 if i in processes:
                     processes.pop(i).close()
-            print(f"    {contender.name}: {outcomes[i].missing or 'ready'}", file=sys.stderr)
         _go_round(processes, outcomes, repeats, budget)
         for i, process in processes.items():
             arrays = Path(folder, f"{i}.npz")
             process.ask(f"save {arrays}")
             outcomes[i].arrays = dict(np.load(arrays))
             process.close()
+    for outcome in outcomes:
+        print(f"    {outcome.contender.name}: {outcome.missing or f'{outcome.median:.3g} s'}")
     return outcomes
 
 
