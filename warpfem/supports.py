@@ -202,12 +202,17 @@ class Supports:
 
     def hold(self, u: wp.array, v: wp.array) -> None:
         """Puts the held components of ``u`` and ``v`` at their targets."""
-        wp.launch(
+        self.record_hold(u, v).launch()
+
+    def record_hold(self, u: wp.array, v: wp.array) -> wp.Launch:
+        """The launch of :meth:`hold`."""
+        return wp.launch(
             self.kernels.hold,
             self.count,
             inputs=[self.points, self.held, self.target, self.target_rate],
             outputs=[u, v],
             device=self.device,
+            record_cmd=True,
         )
 
     def project(self, vector: wp.array) -> None:

@@ -98,7 +98,7 @@ class _Passes:
         """Takes the step.
 
         Args:
-            kick_drift: what launches the move, :meth:`_ExplicitStepper._launch_kick_drift`; not kept, because a stepper
+            kick_drift: what launches the move, :meth:`_ExplicitStepper._record_kick_drift`; not kept, because a stepper
                 that its passes hold would stay with all its arrays until Python looks for cycles.
             state: the state.
             settings: of the move.
@@ -120,7 +120,7 @@ class _Passes:
             for launches, points in zip(second, self._points, strict=True):
                 launches.append(force.record_sums(self._force, points))
         for launches, points in zip(second, self._points, strict=True):
-            launches.append(kick_drift(state, points, *settings, record=True))
+            launches.append(kick_drift(state, points, *settings))
         return _jobs(first), _jobs(second)
 
 
@@ -165,6 +165,8 @@ class _ExplicitStepper(Stepper):
             self._passes = _Passes(model, self._force)
         self.forces = self._describe_forces()
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
+        self._inverse_mass = self._free_inverse_mass()
+        self._launches: dict[tuple, wp.Launch] = {}
 
     def step(self, state: State, dt: float) -> StepReport:
         with self._flushed:
@@ -173,6 +175,24 @@ class _ExplicitStepper(Stepper):
 
     @abstractmethod
     def _take_step(self, state: State, dt: float) -> None: ...
+
+    def _free_inverse_mass(self) -> wp.array:
+        """1/m of each point, 0 where it is held: reactions must not look as if points had become fast."""
+        model = self.model
+        if model.supports is None:
+            return model.inverse_mass
+        inverse = model.inverse_mass.numpy().copy()
+        held = model.supports.held.numpy().reshape(model.supports.count, -1).all(axis=1)
+        inverse[model.supports.points.numpy()[held]] = 0.0
+        return wp.array(inverse, dtype=model.types.scalar, device=model.device)
+
+    def _launch(self, key: tuple, record: Callable[[], wp.Launch]) -> None:
+        """Launches what was recorded under a key, which takes a tenth of the time of launching anew."""
+        if key not in self._launches:
+            if len(self._launches) == RECORDED_PASSES:
+                self._launches.clear()
+            self._launches[key] = record()
+        self._launches[key].launch()
 
     def _describe_forces(self) -> str:
         count = sum(block.count for block in self.model.blocks if block.vectorized)
@@ -185,7 +205,8 @@ class _ExplicitStepper(Stepper):
         return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
 
     def arrays(self) -> list[wp.array]:
-        return [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]
+        own = [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]
+        return own if self.model.supports is None else [*own, self._inverse_mass]
 
     def stable_dt(self, state: State | None = None) -> float:
         if self._rest_frequency is None:
@@ -255,11 +276,13 @@ class _ExplicitStepper(Stepper):
                 self._kick_drift(state, kick, drift)
             return
         self.model.external_force(state.u, self._force)
-        self._passes.run(self._launch_kick_drift, state, *self._impulse(kick), drift, self._watched_speed)
+        self._passes.run(self._record_kick_drift, state, *self._impulse(kick), drift, self._watched_speed)
 
     def _kick_drift(self, state: State, kick: float, drift: float) -> None:
         """Lets forces and damping act for a time, as v' = f / m - alpha v has it, then moves for another."""
-        self._launch_kick_drift(state, range(self.model.point_count), *self._impulse(kick), drift, self._watched_speed)
+        points, settings = range(self.model.point_count), (*self._impulse(kick), drift, self._watched_speed)
+        key = (state.u.ptr, state.v.ptr, *settings)
+        self._launch(key, lambda: self._record_kick_drift(state, points, *settings))
 
     def _impulse(self, kick: float) -> tuple[float, float]:
         """What is left of the velocity after a time, and the time for which the force counts."""
@@ -268,8 +291,8 @@ class _ExplicitStepper(Stepper):
             return 1.0, kick
         return math.exp(-alpha * kick), -math.expm1(-alpha * kick) / alpha
 
-    def _launch_kick_drift(
-        self, state: State, points: range, decay: float, kick: float, drift: float, speed: float, record: bool = False
+    def _record_kick_drift(
+        self, state: State, points: range, decay: float, kick: float, drift: float, speed: float
     ) -> wp.Launch | None:
         per_task = CHUNK if self.model.device.is_cpu else 1  # a GPU has a thread for each
         return wp.launch(
@@ -280,7 +303,7 @@ class _ExplicitStepper(Stepper):
                 points.stop,
                 per_task,
                 self._force,
-                self.model.inverse_mass,
+                self._inverse_mass,
                 decay,
                 kick,
                 drift,
@@ -288,12 +311,12 @@ class _ExplicitStepper(Stepper):
             ],
             outputs=[state.u, state.v, self._alarm],
             device=self.model.device,
-            record_cmd=record,
+            record_cmd=True,
         )
 
     def _hold(self, state: State) -> None:
         if self.model.supports is not None:
-            self.model.supports.hold(state.u, state.v)
+            self._launch((state.u.ptr, state.v.ptr), lambda: self.model.supports.record_hold(state.u, state.v))
 
     def _begin(self, state: State, dt: float) -> None:
         self._check_dt(state, dt)
