@@ -31,6 +31,9 @@ def stub(tmp_path, monkeypatch):
     (folder / "serving.py").write_text((own / "serving.py").read_text())
     (folder / "stub.py").write_text(SCRIPT)
     (folder / "broken.py").write_text("raise SystemExit('it has no such material')")
+    (folder / "dying.py").write_text(
+        SCRIPT.replace("turns.append", "len(turns) == 2 and exit('it died'); turns.append")
+    )
     monkeypatch.setattr(turns, "CONTENDERS", folder)
     return tmp_path
 
@@ -51,11 +54,12 @@ def test_who_is_missing_is_told_and_the_others_run(stub):
     who = [
         Contender("elsewhere", "stub.py", "no_such_peer", {"seconds": 1.0}),
         Contender("broken", "broken.py"),
+        Contender("dying", "dying.py", options={"seconds": 1.0}),
         Contender("present", "stub.py", options={"seconds": 1.0}),
     ]
     outcomes = take_turns(who, {"x": np.arange(3)}, 3, stub)
-    assert [o.missing for o in outcomes] == ["not installed", "it has no such material", ""]
-    assert outcomes[0].summary()["turns"] == [] and len(outcomes[2].seconds) == 3
+    assert [o.missing for o in outcomes] == ["not installed", "it has no such material", "it died", ""]
+    assert outcomes[0].summary()["turns"] == [] and len(outcomes[3].seconds) == 3
 
 
 def test_the_page_tells_what_falls_short_and_who_is_missing(tmp_path):

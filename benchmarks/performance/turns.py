@@ -1,5 +1,6 @@
 """Runs contenders in turn: each is a process that waits while the others run."""
 
+import contextlib
 import json
 import os
 import statistics
@@ -126,12 +127,14 @@ class _Process:
         return json.loads(line)
 
     def ask(self, command: str) -> dict[str, Any]:
-        self._process.stdin.write(command + "\n")
-        self._process.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):  # then there is no answer, and the reason is told
+            self._process.stdin.write(command + "\n")
+            self._process.stdin.flush()
         return self.answer()
 
     def close(self) -> None:
-        self._process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
         try:
             self._process.wait(timeout=30.0)
         except subprocess.TimeoutExpired:
