@@ -12,6 +12,7 @@ import importlib
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -34,20 +35,24 @@ def main() -> None:
         peers.install(folder)
     path = options.out.with_suffix("") / "results.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    results = json.loads(path.read_text()) if path.exists() else {}
+
+    def known() -> dict[str, Any]:
+        return json.loads(path.read_text()) if path.exists() else {}
+
     for name in options.case:
         print(name)
         case = importlib.import_module(f"performance.{name}")
-        results[name] = {
+        found = {
             "machine": machine.facts(),
             "versions": {peer: peers.version(peer, folder) for peer in ("warpfem", "warp", *peers.PEERS)},
             "quick": options.quick,
             **case.run(options.quick, folder, tuple(options.threads)),
         }
+        results = {**known(), name: found}  # others may have come by since
         path.write_text(json.dumps(results, indent=1) + "\n")
     from performance.report import write  # needs matplotlib, which measuring does not
 
-    write(results, options.out)
+    write(known(), options.out)
 
 
 if __name__ == "__main__":
