@@ -40,19 +40,33 @@ def symmetric_part(A: Any):
 
 @wp.func
 def select(condition: bool, A: mat22, B: mat22):
-    """A if the condition holds, else B, chosen entry by entry: without a branch."""
-    for i in range(2):
-        for j in range(2):
-            B[i, j] = wp.where(condition, A[i, j], B[i, j])
-    return B
+    """A if the condition holds, else B, chosen entry by entry: without a branch, and nothing is overwritten, which
+    Warp's reverse mode would not undo."""
+    return wp.matrix_from_rows(
+        wp.vector(wp.where(condition, A[0, 0], B[0, 0]), wp.where(condition, A[0, 1], B[0, 1])),
+        wp.vector(wp.where(condition, A[1, 0], B[1, 0]), wp.where(condition, A[1, 1], B[1, 1])),
+    )
 
 
 @wp.func
 def select(condition: bool, A: mat33, B: mat33):  # noqa: F811
-    for i in range(3):
-        for j in range(3):
-            B[i, j] = wp.where(condition, A[i, j], B[i, j])
-    return B
+    return wp.matrix_from_rows(
+        wp.vector(
+            wp.where(condition, A[0, 0], B[0, 0]),
+            wp.where(condition, A[0, 1], B[0, 1]),
+            wp.where(condition, A[0, 2], B[0, 2]),
+        ),
+        wp.vector(
+            wp.where(condition, A[1, 0], B[1, 0]),
+            wp.where(condition, A[1, 1], B[1, 1]),
+            wp.where(condition, A[1, 2], B[1, 2]),
+        ),
+        wp.vector(
+            wp.where(condition, A[2, 0], B[2, 0]),
+            wp.where(condition, A[2, 1], B[2, 1]),
+            wp.where(condition, A[2, 2], B[2, 2]),
+        ),
+    )
 
 
 @wp.func
