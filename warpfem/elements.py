@@ -284,6 +284,22 @@ class ElementKernels:
         """
         return self._linear_frequency() if self.shape.order == 1 else self._quadratic_frequency()
 
+    def _gradient_products(self) -> wp.Function:
+        """The sum of b_a b_a^T over the gradients of all d + 1 shape functions of a linear cell, of which B has d."""
+        dim = self.dim
+        vector, matrix = self.types.vector, self.types.matrix
+
+        @wp.func
+        def gradient_products(B: matrix):
+            first = vector()
+            Q = matrix()
+            for k in range(dim):
+                first = first + B[k]
+                Q += wp.outer(B[k], B[k])
+            return Q + wp.outer(first, first)
+
+        return gradient_products
+
     def _linear_frequency(self) -> wp.Kernel:
         """On the change of H, with lumped mass G -> (d + 1)/rho dP(G) sum_a b_a b_a^T, from the shortest height."""
         dim = self.dim
@@ -291,6 +307,7 @@ class ElementKernels:
         parameter_vector = self.parameter_vector
         displacement_gradient = self._displacement_gradient
         stress_differential = self.constitutive.stress_differential
+        gradient_products = self._gradient_products()
 
         @wp.kernel(module="unique", enable_backward=False)
         def element_frequency(
@@ -304,12 +321,7 @@ class ElementKernels:
             i = wp.tid()
             B = inverse_shape[i]
             H = displacement_gradient(u, cells[i], B)
-            first = vector()
-            Q = matrix()
-            for k in range(dim):
-                first = first + B[k]
-                Q += wp.outer(B[k], B[k])
-            Q += wp.outer(first, first)
+            Q = gradient_products(B)
             scale = wp.trace(Q)
             Q = Q / scale
             G = Q
@@ -410,6 +422,7 @@ class ElementKernels:
         displacement_gradient = self._displacement_gradient
         stress_differential = self.constitutive.stress_differential
         operator = wp.types.matrix(shape=(dim * dim, dim * dim), dtype=wp.float64)
+        gradient_products = self._gradient_products()
 
         @wp.kernel(module="unique", enable_backward=False)
         def element_frequency_bound(
@@ -422,12 +435,7 @@ class ElementKernels:
             i = wp.tid()
             B = inverse_shape[i]
             H = displacement_gradient(u, cells[i], B)
-            first = vector()
-            Q = matrix()
-            for k in range(dim):
-                first = first + B[k]
-                Q += wp.outer(B[k], B[k])
-            Q += wp.outer(first, first)
+            Q = gradient_products(B)
             A = operator()
             count = int(dim)
             for k in range(count):

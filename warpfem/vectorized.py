@@ -262,7 +262,6 @@ class VectorizedForce:
     ) -> None:
         t = kernels.types
         dim = self.dim = kernels.dim
-        self._scalar = t.scalar
         dtype = "float32" if t.scalar is wp.float32 else "float64"
         uniform = len(parameters) == 1
         made_for = (kernels.constitutive, dim, dtype, uniform)

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.linear.conjugate_gradients import RenewedPreconditioner
-from warpfem.linear.operators import AssembledOperator
+from warpfem.linear.operators import AssembledOperator, add_row_product
 
 DEGREE = 2
 """Of the Chebyshev polynomials, each of which takes as many products."""
@@ -280,19 +280,6 @@ def _level_kernels(block: int) -> SimpleNamespace:
     vector, matrix = _vector(block), _matrix(block, block)
     module = f"warpfem.multigrid_{block}"
 
-    @wp.func
-    def row_product(
-        row_starts: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        blocks: wp.array(dtype=matrix),
-        x: wp.array(dtype=vector),
-        i: int,
-    ):
-        total = vector()
-        for slot in range(row_starts[i], row_starts[i + 1]):
-            total += blocks[slot] * x[columns[slot]]
-        return total
-
     @wp.kernel(module=module, enable_backward=False)
     def begin(
         b: wp.array(dtype=vector),
@@ -322,7 +309,7 @@ def _level_kernels(block: int) -> SimpleNamespace:
     ):
         """r = b - A x, d = factor D^-1 r."""
         i = wp.tid()
-        r = b[i] - row_product(row_starts, columns, blocks, x, i)
+        r = b[i] - add_row_product(row_starts, columns, blocks, x, i, vector())
         r_out[i] = r
         d_out[i] = factor * (inverse[i] * r)
 
@@ -342,7 +329,7 @@ def _level_kernels(block: int) -> SimpleNamespace:
         """x += d, r -= A d, then d = keep d + factor D^-1 r."""
         i = wp.tid()
         x_out[i] += d[i]
-        r = r_out[i] - row_product(row_starts, columns, blocks, d, i)
+        r = r_out[i] - add_row_product(row_starts, columns, blocks, d, i, vector())
         r_out[i] = r
         d_out[i] = keep * d[i] + factor * (inverse[i] * r)
 
@@ -381,10 +368,7 @@ def _transfer_kernels(fine: int, coarse: int) -> SimpleNamespace:
     ):
         """Writes P^T r."""
         i = wp.tid()
-        total = coarse_vector()
-        for slot in range(row_starts[i], row_starts[i + 1]):
-            total += blocks[slot] * r[columns[slot]]
-        b_out[i] = total
+        b_out[i] = add_row_product(row_starts, columns, blocks, r, i, coarse_vector())
 
     @wp.kernel(module=module, enable_backward=False)
     def prolong(
@@ -396,9 +380,6 @@ def _transfer_kernels(fine: int, coarse: int) -> SimpleNamespace:
     ):
         """Adds P x."""
         i = wp.tid()
-        total = fine_vector()
-        for slot in range(row_starts[i], row_starts[i + 1]):
-            total += blocks[slot] * x[columns[slot]]
-        x_out[i] += total
+        x_out[i] += add_row_product(row_starts, columns, blocks, x, i, fine_vector())
 
     return SimpleNamespace(restrict=restrict, prolong=prolong)

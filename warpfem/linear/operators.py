@@ -8,7 +8,7 @@ assembled route stores K as d x d blocks in compressed rows, whose pattern is fo
 import functools
 from abc import ABC, abstractmethod
 from types import SimpleNamespace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import warp as wp
 
@@ -20,6 +20,22 @@ from warpfem.model import CellBlock, Model, Route
 from warpfem.tensor import is_positive_definite
 
 Hessian: TypeAlias = Literal["exact", Filter]
+
+
+@wp.func
+def add_row_product(
+    row_starts: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    blocks: wp.array(dtype=Any),
+    p: wp.array(dtype=Any),
+    i: int,
+    start: Any,
+):
+    """``start`` plus the product of row i of a block-sparse matrix with p."""
+    total = start
+    for slot in range(row_starts[i], row_starts[i + 1]):
+        total += blocks[slot] * p[columns[slot]]
+    return total
 
 
 @functools.cache
@@ -66,10 +82,7 @@ def operator_kernels(dim: int, dtype: str) -> SimpleNamespace:
     ):
         """Writes the product of a block-sparse matrix with p."""
         i = wp.tid()
-        total = vector()
-        for slot in range(row_starts[i], row_starts[i + 1]):
-            total += blocks[slot] * p[columns[slot]]
-        product_out[i] = total
+        product_out[i] = add_row_product(row_starts, columns, blocks, p, i, vector())
 
     @wp.kernel(module=module, enable_backward=False)
     def subtract_product(

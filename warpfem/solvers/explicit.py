@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -22,20 +23,21 @@ from warpfem.threads import Job, Team, share
 from warpfem.vectorized import WINDOW
 
 TRACKING_INTERVALS = (16, 1024)
-"""Bounds of the steps after which the stability limit is estimated again, at the cost of some six steps: the fewer
+"""Bounds of the steps after which the stability limit is estimated again, at the cost of some twenty steps: the fewer
 cells, the sooner a wave has crossed them, and the less it matters."""
 
 CELLS_PER_THREAD = 8192
 """Cells for which a thread is worth while: handing over work costs as much as the forces of some thousand."""
 
-RECORDED_PASSES = 8
-"""Recorded passes kept: with a fixed dt there are two."""
+MOST_RECORDED = 8
+"""Recordings kept: with a fixed dt there are two or three. Launching one takes a tenth of launching anew."""
 
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
 
 
 KickDrift = Callable[..., wp.Launch | None]
+Recording = TypeVar("Recording")
 
 
 @functools.cache
@@ -76,6 +78,21 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
     return kick_drift
 
 
+class _Recordings:
+    """What has been recorded under some keys: the last few, since arguments like dt may change for ever."""
+
+    def __init__(self) -> None:
+        self._recorded: dict[tuple, Any] = {}
+
+    def get(self, key: tuple, record: Callable[[], Recording]) -> Recording:
+        """What ``record`` makes the first time."""
+        if key not in self._recorded:
+            if len(self._recorded) == MOST_RECORDED:
+                self._recorded.clear()
+            self._recorded[key] = record()
+        return self._recorded[key]
+
+
 class _Passes:
     """A step of vectorised bodies as two passes of recorded launches, each divided among threads.
 
@@ -88,7 +105,7 @@ class _Passes:
         self._force = force
         self._team = Team(max(1, min(model.threads, model.cell_count // CELLS_PER_THREAD)))
         self._points = share(model.point_count, self._team.size, WINDOW)
-        self._recorded: dict[tuple, tuple[list[Job], list[Job]]] = {}
+        self._recordings = _Recordings()
 
     @property
     def thread_count(self) -> int:
@@ -104,11 +121,7 @@ class _Passes:
             settings: of the move.
         """
         key = (state.u.ptr, state.v.ptr, *settings)
-        if key not in self._recorded:
-            if len(self._recorded) == RECORDED_PASSES:
-                self._recorded.clear()
-            self._recorded[key] = self._record(kick_drift, state, *settings)
-        for jobs in self._recorded[key]:
+        for jobs in self._recordings.get(key, lambda: self._record(kick_drift, state, *settings)):
             self._team.run(jobs)
 
     def _record(self, kick_drift: KickDrift, state: State, *settings: float) -> tuple[list[Job], list[Job]]:
@@ -166,7 +179,7 @@ class _ExplicitStepper(Stepper):
         self.forces = self._describe_forces()
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
         self._inverse_mass = self._free_inverse_mass()
-        self._launches: dict[tuple, wp.Launch] = {}
+        self._recordings = _Recordings()
 
     def step(self, state: State, dt: float) -> StepReport:
         with self._flushed:
@@ -185,14 +198,6 @@ class _ExplicitStepper(Stepper):
         held = model.supports.held.numpy().reshape(model.supports.count, -1).all(axis=1)
         inverse[model.supports.points.numpy()[held]] = 0.0
         return wp.array(inverse, dtype=model.types.scalar, device=model.device)
-
-    def _launch(self, key: tuple, record: Callable[[], wp.Launch]) -> None:
-        """Launches what was recorded under a key, which takes a tenth of the time of launching anew."""
-        if key not in self._launches:
-            if len(self._launches) == RECORDED_PASSES:
-                self._launches.clear()
-            self._launches[key] = record()
-        self._launches[key].launch()
 
     def _describe_forces(self) -> str:
         count = sum(block.count for block in self.model.blocks if block.vectorized)
@@ -282,7 +287,7 @@ class _ExplicitStepper(Stepper):
         """Lets forces and damping act for a time, as v' = f / m - alpha v has it, then moves for another."""
         points, settings = range(self.model.point_count), (*self._impulse(kick), drift, self._watched_speed)
         key = (state.u.ptr, state.v.ptr, *settings)
-        self._launch(key, lambda: self._record_kick_drift(state, points, *settings))
+        self._recordings.get(key, lambda: self._record_kick_drift(state, points, *settings)).launch()
 
     def _impulse(self, kick: float) -> tuple[float, float]:
         """What is left of the velocity after a time, and the time for which the force counts."""
@@ -315,8 +320,10 @@ class _ExplicitStepper(Stepper):
         )
 
     def _hold(self, state: State) -> None:
-        if self.model.supports is not None:
-            self._launch((state.u.ptr, state.v.ptr), lambda: self.model.supports.record_hold(state.u, state.v))
+        supports = self.model.supports
+        if supports is not None:
+            key = (state.u.ptr, state.v.ptr)
+            self._recordings.get(key, lambda: supports.record_hold(state.u, state.v)).launch()
 
     def _begin(self, state: State, dt: float) -> None:
         self._check_dt(state, dt)
