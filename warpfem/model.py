@@ -22,6 +22,7 @@ from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
 from warpfem.stiffness import all_blocks, pair_count
+from warpfem.strips import STRIP
 from warpfem.threads import CELLS_PER_THREAD, Team, available_threads
 
 if TYPE_CHECKING:
@@ -522,6 +523,16 @@ class Model:
         """
         for block in self.blocks:
             block.vectorize(self.rest_points, least, self.team)
+
+    def describe_forces(self) -> str:
+        """How :meth:`add_internal_force` computes them, and on how many threads."""
+        count = sum(block.count for block in self.blocks if block.vectorized)
+        if not count:
+            return "one cell at a time, on one thread"
+        plain = self.cell_count - count
+        others = f", {plain} others one at a time" if plain else ""
+        threads = "1 thread" if self.team.size == 1 else f"{self.team.size} threads"
+        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""
