@@ -40,6 +40,16 @@ def test_most_strips_are_full():
     assert mesh.cell_count / len(cut_into_strips(mesh.points, mesh.cells).cells) > 2.8
 
 
+@pytest.mark.parametrize("axes", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+def test_a_half_of_the_strips_is_about_a_half_of_the_points(axes):
+    """Along whichever axis points are numbered: threads would wait for what another one has just written."""
+    mesh = wf.Mesh.box((1, 1, 1), (10, 10, 10))
+    strips = cut_into_strips(mesh.points[:, axes], mesh.cells)
+    of_strips = np.arange(len(strips.points)) < len(strips.points) // 2
+    of_points = strips.points < len(mesh.points) // 2
+    assert (of_points != of_strips[:, None]).mean() < 0.1
+
+
 def _scene(mesh, material, **settings):
     return wf.Scene(
         [wf.Body("body", mesh, material)], wf.SymplecticEuler(), gravity=(0, -9.81, 0)[: mesh.dim], **settings

@@ -30,19 +30,31 @@ class Strips:
 def cut_into_strips(points: np.ndarray, cells: np.ndarray) -> Strips:
     """Divides linear cells into strips, neighbours in space close to one another in the list.
 
+    Halves of the list are halves of the body along the axis by which the points are numbered first of all, so that
+    threads that have a part of the strips and one of the points share few of them.
+
     Args:
         points: (point_count, dim) [m].
         cells: (cell_count, dim + 1) int.
     """
-    order = np.argsort(_space_filling_keys(points[cells].mean(axis=1)), kind="stable")
+    axes = _numbering_axes(points)
+    order = np.argsort(_space_filling_keys(points[cells].mean(axis=1)[:, axes]), kind="stable")
     chains = _chains(_neighbours(cells[order]))
     found = chains >= 0
     chains = np.where(found, order[chains], -1)
     return Strips(_numbered(cells, chains, found.sum(axis=1)), chains)
 
 
+def _numbering_axes(points: np.ndarray) -> np.ndarray:
+    """The axes, from that along which points are numbered last to that along which they are numbered first of all."""
+    number = np.arange(len(points)) - 0.5 * (len(points) - 1)
+    centred = points - points.mean(axis=0)
+    spread = np.maximum(np.linalg.norm(centred, axis=0), np.finfo(np.float64).tiny)
+    return np.argsort(np.abs(number @ centred) / spread, kind="stable")
+
+
 def _space_filling_keys(places: np.ndarray) -> np.ndarray:
-    """Keys along the curve of Morton (1966): the bits of the coordinates, interleaved."""
+    """Keys along the curve of Morton (1966): the bits of the coordinates, interleaved, the last axis first."""
     dim, bits = places.shape[1], 20
     extent = max(float(np.ptp(places, axis=0).max()), np.finfo(np.float64).tiny)
     grid = ((places - places.min(axis=0)) / extent * (2**bits - 1)).astype(np.int64)
