@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -14,6 +14,7 @@ from warpfem.materials import HookeanMaterial, Material
 from warpfem.mesh import Mesh
 
 if TYPE_CHECKING:
+    from warpfem.motion import Motion
     from warpfem.solvers.base import Solver
 
 PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
@@ -199,6 +200,9 @@ class Scene:
         frames: frames to simulate after the initial one, >= 0.
         up_axis: "Y" or "Z": which way is up in the USD file.
         color_by: "von_mises" or "jacobian": the quantity that colours the bodies in the USD file.
+        quantities: numbers of the motion that matter, by name, each a function of a :class:`warpfem.motion.Motion`
+            (``warpfem.quantities`` has the usual ones): ``warpfem trade`` measures their errors, and a plain run does
+            not compute them.
     """
 
     bodies: Sequence[Body]
@@ -211,6 +215,7 @@ class Scene:
     frames: int = 48
     up_axis: Literal["Y", "Z"] = "Y"
     color_by: Literal["von_mises", "jacobian"] = "von_mises"
+    quantities: Mapping[str, Callable[[Motion], float]] = field(default_factory=dict)
     dim: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -247,6 +252,17 @@ class Scene:
                 raise SceneError(f"an obstacle must be a Plane, Sphere or BoxWalls, not {obstacle!r}")
             vector = getattr(obstacle, "point", getattr(obstacle, "center", getattr(obstacle, "lower", ())))
             self._check_vector(f"{type(obstacle).__name__}: its place", vector)
+        self._check_quantities()
+
+    def _check_quantities(self) -> None:
+        if not isinstance(self.quantities, Mapping):
+            raise SceneError(f"quantities must be a dict from names to functions, not {self.quantities!r}")
+        for name, quantity in self.quantities.items():
+            if not isinstance(name, str) or not name.strip() or not callable(quantity):
+                raise SceneError(
+                    f"quantities must map names to functions of a motion, such as "
+                    f"quantities.final_displacement('body', at=(0, 0, 0), axis=1), not {name!r} to {quantity!r}"
+                )
 
     def _check_number(self, name: str, value: object, positive: bool = False) -> None:
         if not is_number(value) or value < 0.0 or (positive and value == 0.0):  # type: ignore[operator]

@@ -41,6 +41,16 @@ def load_scene(path: str | Path, settings: Mapping[str, str] | None = None) -> S
     return scene
 
 
+def scene_parameters(path: str | Path) -> Mapping[str, inspect.Parameter]:
+    """The parameters of a scene file's function ``scene``, by name.
+
+    Raises:
+        SceneError: as :func:`load_scene`.
+    """
+    path = Path(path)
+    return _parameters(path, _scene_function(path))
+
+
 def _scene_function(path: Path) -> Callable[..., Any]:
     if not os.path.isfile(path):  # unlike the path's own method it bears any name
         raise SceneError(f"no scene file '{path}'")
@@ -72,11 +82,15 @@ def _call(path: Path, action: Callable[[], Any]) -> Any:
             sys.path.remove(folder)
 
 
-def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:
+def _parameters(path: Path, function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
     try:
-        parameters = inspect.signature(function).parameters
+        return inspect.signature(function).parameters
     except (TypeError, ValueError) as error:
         raise SceneError(f"{path}: scene must be a function scene(**parameters) -> Scene, not {function!r}") from error
+
+
+def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:
+    parameters = _parameters(path, function)
     arguments = {}
     for name, text in settings.items():
         if name not in parameters:
