@@ -265,9 +265,7 @@ class Mesh:
         """
         own = self.quadratic()
         parts = len(own.shape.parts)
-        sets = {
-            name: (parts * members[:, None] + np.arange(parts)).ravel() for name, members in self.cell_sets.items()
-        }
+        sets = {name: (parts * members[:, None] + np.arange(parts)).ravel() for name, members in self.cell_sets.items()}
         return Mesh(own.points, own.linear_cells, own.point_sets, sets)
 
     def with_midpoints(self, members: np.ndarray) -> np.ndarray:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-from warpfem.boundary import Load, Obstacle, Pin, PrescribedMotion, Support, Traction, Vector, is_number
+from warpfem.boundary import Load, Obstacle, Pin, PointForce, PrescribedMotion, Support, Traction, Vector, is_number
 from warpfem.errors import SceneError, source_of, user_code
 from warpfem.materials import HookeanMaterial, Material
 from warpfem.mesh import Mesh
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
 """One vector for all points, an array (point_count, dim), or a function of the rest points."""
 
+Term = TypeVar("Term")
 
 ELEMENTS = ("linear", "quadratic", "averaged")
 """What a body's cells can be."""
@@ -140,7 +141,7 @@ class Body:
                 f"{nu:g}: take element='linear', which does not lock there"
             )
 
-    def _with_midpoints(self, term: object) -> object:
+    def _with_midpoints(self, term: Term) -> Term:
         """The term with the midpoints between the points of the linear mesh that it lists; sets have theirs."""
         if not isinstance(term, Pin | PrescribedMotion | Traction) or isinstance(term.points, str):
             return term
@@ -149,6 +150,35 @@ class Body:
         except ValueError:
             return term  # refused where its body is named
         return replace(term, points=self.mesh.with_midpoints(members))
+
+    def refined(self) -> Body:
+        """The body with each of its cells divided into 4 (2D) or 8 (3D); forces on points stay where they are."""
+        mesh = self.mesh
+        parts = len(mesh.quadratic().shape.parts)
+
+        def per_point(value: PointField | None) -> PointField | None:
+            if value is None or callable(value) or mesh.order == 2:
+                return value
+            array = np.asarray(value)
+            if array.ndim == 1:
+                return array
+            return np.concatenate([array, array[mesh.edges].mean(axis=1)])
+
+        def term(own: Term) -> Term:
+            if isinstance(own, PointForce):  # on the same points, whatever their set gains
+                return replace(own, points=mesh.select_points(own.points))
+            return own if mesh.order == 2 else self._with_midpoints(own)
+
+        return replace(
+            self,
+            mesh=mesh.refined(),
+            material=self.material.repeated(parts),
+            density=np.repeat(self.density, parts) if isinstance(self.density, np.ndarray) else self.density,
+            supports=[term(own) for own in self.supports],
+            loads=[term(own) for own in self.loads],
+            displacement=per_point(self.displacement),
+            velocity=per_point(self.velocity),
+        )
 
     def initial_displacement(self) -> np.ndarray:
         """Initial displacement, (point_count, dim) float64 [m]."""
