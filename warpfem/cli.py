@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import warpfem
 from warpfem.checkpoint import Checkpoint, checkpoint_path
 from warpfem.dtypes import FloatName
-from warpfem.errors import OutputError, SimulationError, TimeStepError, WarpfemError
+from warpfem.errors import MissingExtraError, OutputError, SimulationError, TimeStepError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 from warpfem.solvers import StaticEquilibrium
@@ -138,6 +139,8 @@ def _parser() -> argparse.ArgumentParser:
     _time_options(explain)
     explain.set_defaults(command=_explain)
 
+    _trade_parser(commands)
+
     preview = commands.add_parser("preview", help="draw a run to PNG or GIF", description=_preview.__doc__)
     preview.add_argument("file", type=Path, metavar="FILE", help="a USD file that warpfem wrote")
     preview.add_argument(
@@ -166,6 +169,79 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _trade_parser(commands: Any) -> None:
+    trade = commands.add_parser(
+        "trade", help="measure what accuracy costs in a scene, setting by setting", description=_trade.__doc__
+    )
+    trade.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
+    _set_option(trade)
+    trade.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
+    trade.add_argument("--frames", type=_positive, metavar="N", help="frames to simulate after the initial one")
+    trade.add_argument(
+        "--axis",
+        action="append",
+        default=[],
+        dest="axes",
+        metavar="NAME=VALUE,...",
+        help="what to vary, may be repeated: a parameter of the scene, or dt, solver, element, material, dtype, refine "
+        "(how often all cells are divided), or a setting of the solver such as tolerance; without any, the mesh, the "
+        "element, the scheme and dt",
+    )
+    trade.add_argument(
+        "--error",
+        type=_error,
+        action="append",
+        dest="errors",
+        metavar="E",
+        help="relative error to find the cheapest setting for, as 1%% or 0.01; may be repeated (default: 10%%, 1%% and "
+        "0.1%%)",
+    )
+    trade.add_argument(
+        "--quantity",
+        default="l2",
+        metavar="Q",
+        help="what the error is of: a quantity that the scene declares, or l2 or max, the norms of the motion "
+        "(default: %(default)s)",
+    )
+    trade.add_argument(
+        "--repeats", type=_positive, default=3, metavar="N", help="processes that time each setting (default: 3)"
+    )
+    trade.add_argument(
+        "--limit",
+        type=_positive,
+        default=300,
+        metavar="SECONDS",
+        help="wall time after which a setting has failed, also one of the reference (default: %(default)s)",
+    )
+    where = trade.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers",
+        type=_positive,
+        default=1,
+        metavar="N",
+        help="settings that run at the same time on this machine: their times are marked, and not mixed with others",
+    )
+    where.add_argument("--scheduler", metavar="ADDRESS", help="scheduler of a Dask cluster to run the settings on")
+    trade.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder of the results, and of the runs that a study goes on from (default: output/SCENE.trade)",
+    )
+    trade.add_argument("--json", action="store_true", help="print the results as JSON, and nothing else")
+    trade.set_defaults(command=_trade)
+
+
+def _error(text: str) -> float:
+    number = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    if not 0.0 < number < 1.0:
+        raise argparse.ArgumentTypeError(f"must be between 0 and 100 %, not {text}")
+    return number
+
+
+_error.__name__ = "error"  # argparse's name for what is no number
+
+
 def _positive(text: str) -> int:
     number = int(text)
     if number < 1:
@@ -180,6 +256,10 @@ def _scene_options(parser: argparse.ArgumentParser, dtype: FloatName = "float32"
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
     parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
     parser.add_argument("--dtype", choices=("float32", "float64"), default=dtype, help=f"default: {dtype}")
+    _set_option(parser)
+
+
+def _set_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set",
         action="append",
@@ -198,15 +278,20 @@ def _time_options(parser: argparse.ArgumentParser) -> None:
 def _load(arguments: argparse.Namespace) -> Scene:
     from warpfem.scene_file import load_scene
 
+    scene = load_scene(arguments.scene, _parameters(arguments))
+    given = {"frames": arguments.frames, "fps": arguments.fps}
+    return replace(scene, **{name: value for name, value in given.items() if value is not None})
+
+
+def _parameters(arguments: argparse.Namespace) -> dict[str, str]:
+    """What --set gives."""
     settings = {}
     for text in arguments.settings:
         name, equals, value = text.partition("=")
         if not equals or not name.isidentifier():
             raise WarpfemError(f"--set takes NAME=VALUE, for example --set cells=16, not '{text}'")
         settings[name] = value
-    scene = load_scene(arguments.scene, settings)
-    given = {"frames": arguments.frames, "fps": arguments.fps}
-    return replace(scene, **{name: value for name, value in given.items() if value is not None})
+    return settings
 
 
 def _start_warp() -> None:
@@ -483,6 +568,64 @@ def _explain(arguments: argparse.Namespace) -> int:
     _start_warp()
     print(explain(_load(arguments), device=arguments.device, dtype=arguments.dtype))
     return OK
+
+
+def _trade(arguments: argparse.Namespace) -> int:
+    """Measures what accuracy costs in a scene: runs all combinations of the axes' values, each in a process of its own
+    and several times, and compares them with a reference that is finer in space and time.
+
+    Writes trade.csv, trade.json and, with the extra 'plot', trade.png and trade.svg. A study that was interrupted or
+    killed goes on from the runs that it has when the same command is given again.
+    """
+    from warpfem.trade import report
+    from warpfem.trade.axes import default_axes, mesh_control, parse_axes, settings_of
+    from warpfem.trade.executors import cluster_executor, local_executor
+    from warpfem.trade.plot import plot
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.store import Store
+    from warpfem.trade.study import Study
+    from warpfem.trade.sweep import TARGETS, require_quantity, sweep
+
+    _start_warp()
+    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
+    mesh = mesh_control(problem)
+    axes = parse_axes(arguments.axes, problem) or default_axes(problem, mesh)
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.trade"
+    alone = arguments.workers == 1 and arguments.scheduler is None
+    say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
+    executor = cluster_executor(arguments.scheduler) if arguments.scheduler else local_executor(arguments.workers)
+    with executor as pool:
+        study = Study(
+            problem,
+            Store(out),
+            pool,
+            load="serial" if alone else "parallel",
+            limit=float(arguments.limit),
+            threads=None if alone else 1,
+            say=say,
+        )
+        require_quantity(study, arguments.quantity)
+        say(f"{arguments.scene}: {len(settings_of(axes, problem))} settings of {', '.join(a.name for a in axes)}")
+        done = sweep(
+            study,
+            axes,
+            mesh,
+            name=arguments.quantity,
+            targets=arguments.errors or TARGETS,
+            repeats=arguments.repeats,
+        )
+    written = report.write(done, out)
+    if done.reference is not None:
+        try:
+            written += plot(done, out)
+        except MissingExtraError as error:
+            say(str(error))
+    if arguments.json:
+        print(json.dumps(report.data(done), indent=2, allow_nan=False))
+    else:
+        print(report.text(done))
+        print(f"wrote {', '.join(map(str, written))}")
+    return FAILED if done.reference is None or any(answer.refusal for answer in done.answers) else OK
 
 
 def _preview(arguments: argparse.Namespace) -> int:

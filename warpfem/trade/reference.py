@@ -70,7 +70,9 @@ class Reference:
         scales: what errors are relative to, by name: the peak over time of the root mean square displacement, the largest
             displacement [m], and the quantities' own magnitudes.
         parts: error bands by name and by what leaves them: "space", "time" and "algebra".
-        ladders: what was run for it, by "space" and "time", from coarse to fine.
+        ladders: what was run for it, by "space" and "time", from coarse to fine. The first mesh of the one, with the
+            last but one step of the other, is the run that both share.
+        limits: the limit of each ladder: in space with that step, in time with that mesh.
         remarks: what kept it from being more accurate.
     """
 
@@ -78,6 +80,7 @@ class Reference:
     scales: dict[str, float]
     parts: dict[str, dict[str, Part]]
     ladders: dict[str, list[Rung]]
+    limits: dict[str, Outcome]
     remarks: list[str] = field(default_factory=list)
 
     @property
@@ -152,7 +155,9 @@ class _Builder:
     # ---- ladders
 
     def _begin(self) -> None:
-        coarsest = max(self.asked, key=lambda p: p.first.mesh_size).setting.only(self.mesh.names) if self.asked else None
+        coarsest = (
+            max(self.asked, key=lambda p: p.first.mesh_size).setting.only(self.mesh.names) if self.asked else None
+        )
         start = coarsest or Setting()
         for element in ("quadratic", "linear"):
             base = start.changed(**{f"{FORCED}element": element})
@@ -234,11 +239,13 @@ class _Builder:
         motion = extrapolate([r.outcome.motion for r in self.space], [r.size for r in self.space])
         bare = self.space[0].outcome  # the coarsest mesh with the time step of all meshes
         field_parts = {"space": motion}
+        limits = {"space": Outcome(times=bare.times, motion=motion.value)}
         total = motion.value
         missing: np.ndarray | float = 0.0
         if self.implicit:
             in_time = extrapolate([r.outcome.motion for r in self.time], [r.outcome.longest_dt for r in self.time])
             field_parts["time"] = in_time
+            limits["time"] = Outcome(times=bare.times, motion=in_time.value)
             missing = in_time.value - bare.motion
             total = total + missing
         scales = {L2: _peak_rms(total), LARGEST: float(np.linalg.norm(total, axis=-1).max())}
@@ -254,12 +261,12 @@ class _Builder:
         parts[LARGEST]["algebra"] = Part(None, rough.largest / scales[LARGEST])
         quantities = {}
         for name in self._shared_quantities():
-            value, scale, own_parts = self._quantity(name, bare, rough)
+            value, scale, parts[name] = self._quantity(name, bare, rough, limits)
             quantities[name] = value
             scales[name] = scale
-            parts[name] = own_parts
         outcome = Outcome(times=bare.times, motion=total, quantities=quantities)
-        return Reference(outcome, scales, parts, {"space": self.space, "time": self.time}, list(self.remarks))
+        ladders = {"space": self.space, "time": self.time}
+        return Reference(outcome, scales, parts, ladders, limits, list(self.remarks))
 
     def _algebra_difference(self, bare: Outcome) -> Difference:
         """What a hundred times the tolerance changes, which is more than the tolerance does."""
@@ -271,15 +278,21 @@ class _Builder:
         rungs = [*self.space, *(self.time if self.implicit else ())]
         return [name for name in self.space[0].outcome.quantities if all(name in r.outcome.quantities for r in rungs)]
 
-    def _quantity(self, name: str, bare: Outcome, rough: Difference) -> tuple[float, float, dict[str, Part]]:
+    def _quantity(
+        self, name: str, bare: Outcome, rough: Difference, limits: dict[str, Outcome]
+    ) -> tuple[float, float, dict[str, Part]]:
+        """The reference's value of a quantity, what its errors are relative to, and the bands."""
+
         def limit(rungs: list[Rung], sizes: list[float]) -> Extrapolated:
             return extrapolate([np.array([r.outcome.quantities[name]]) for r in rungs], sizes)
 
         space = limit(self.space, [r.size for r in self.space])
         value, bands = float(space.value[0]), {"space": space}
+        limits["space"].quantities[name] = value
         cross = 0.0
         if self.implicit:
             bands["time"] = limit(self.time, [r.outcome.longest_dt for r in self.time])
+            limits["time"].quantities[name] = float(bands["time"].value[0])
             cross = float(bands["time"].value[0]) - bare.quantities[name]
             value += cross
         scale = abs(value)
