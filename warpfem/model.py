@@ -22,7 +22,7 @@ from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
 from warpfem.stiffness import all_blocks, pair_count
-from warpfem.threads import available_threads
+from warpfem.threads import CELLS_PER_THREAD, Team, available_threads
 
 if TYPE_CHECKING:
     from warpfem.contact import Contact
@@ -30,10 +30,6 @@ if TYPE_CHECKING:
     from warpfem.vectorized import VectorizedForce
 
 Route = Literal["tape", "closed", "assembled"]
-
-VECTORIZED_CELLS = 1024
-"""Cells of a material from which on explicit steps compute its forces several cells at a time: that takes some seconds
-to compile once, and work to prepare."""
 
 STIFFNESS_PART = 16384
 """Cells whose dense stiffness is held at a time: 19 MB for tetrahedra, where that of a million takes 1.2 GB."""
@@ -209,13 +205,13 @@ class CellBlock:
         own = [] if self.vectorized is None else self.vectorized.arrays()
         return [*self.arguments.values(), *own]
 
-    def vectorize(self, rest_points: np.ndarray) -> None:
-        """Prepares the force of several cells at a time, where that is possible and pays."""
+    def vectorize(self, rest_points: np.ndarray, least: int, team: Team) -> None:
+        """Prepares the force of several cells at a time, where that is possible and there are ``least`` cells."""
         constitutive = self.kernels.constitutive
         # a GPU has lanes of its own, and adds to points by atomics, which it does well
         possible = self.device.is_cpu and self.shape.order == 1 and not self.averaged
         possible = possible and (constitutive.branchless or constitutive.direct_stress is not None)
-        if self.vectorized or not possible or self.count < VECTORIZED_CELLS:
+        if self.vectorized or not possible or self.count < least:
             return
         from warpfem.vectorized import VectorizedForce
 
@@ -227,6 +223,7 @@ class CellBlock:
             self.arguments["inverse_shape"].numpy(),
             self.arguments["volume"].numpy(),
             parameters.numpy()[: 1 if parameters.strides[0] == 0 else None],
+            team,
         )
 
     def add_force(self, u: wp.array, force_out: wp.array) -> None:
@@ -244,17 +241,19 @@ class CellBlock:
         *,
         part: slice | None = None,
         kernels: ElementKernels | None = None,
-    ) -> None:
+        record: bool = False,
+    ) -> wp.Launch | None:
         """Launches the kernel of that name over the quadrature points of the cells, or of a part of them.
 
-        Of :attr:`arguments` it gets first those that it names. Those of frequency and stiffness run over cells.
+        Of :attr:`arguments` it gets first those that it names. Those of frequency and stiffness run over cells. With
+        ``record`` it returns the launch instead.
         """
         kernel = getattr(kernels or self.kernels, name)
         arrays = self.arguments if part is None else self._arguments_of(part)
         own = [arrays[argument.label] for argument in kernel.adj.args if argument.label in arrays]
         by_cell = name == "frequency" or name.endswith("stiffness")
         tasks = len(arrays["cells"]) if by_cell else len(arrays["volume"])
-        wp.launch(kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device)
+        return wp.launch(kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device, record_cmd=record)
 
     def _arguments_of(self, part: slice) -> dict[str, wp.array]:
         places = self.shape.quadrature_count
@@ -280,7 +279,7 @@ class Model:
         scene: the scene.
         device: Warp device.
         dtype: "float32" or "float64".
-        threads: threads of the CPU that explicit steps may use; the results do not depend on them.
+        threads: threads of the CPU that steps may use; the results do not depend on them.
         types: the Warp types.
         point_count, cell_count: totals over the bodies.
         point_starts, cell_starts: first point and cell of each body, with the total at the end.
@@ -414,6 +413,11 @@ class Model:
         return wp.zeros(self.point_count, dtype=self.types.vector, device=self.device)
 
     @cached_property
+    def team(self) -> Team:
+        """The threads that steps use, as many as the cells are worth."""
+        return Team(max(1, min(self.threads, self.cell_count // CELLS_PER_THREAD)) if self.device.is_cpu else 1)
+
+    @cached_property
     def static_load(self) -> wp.array | None:
         """Gravity and constant loads [N] for states of rest, device array, or ``None``: gravity by shape functions.
 
@@ -511,10 +515,13 @@ class Model:
         if self.contact is not None:
             self.contact.add_force(u, force_out)
 
-    def vectorize(self) -> None:
-        """Prepares the forces of explicit steps: on the CPU, of several cells at a time."""
+    def vectorize(self, least: int) -> None:
+        """Prepares the forces of steps on the CPU: of several cells at a time, where a material has ``least`` of them.
+
+        Fewer are not worth the seconds that the compiler takes the first time.
+        """
         for block in self.blocks:
-            block.vectorize(self.rest_points)
+            block.vectorize(self.rest_points, least, self.team)
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""

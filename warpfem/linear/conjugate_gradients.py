@@ -4,6 +4,7 @@ import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -206,8 +207,12 @@ class ConjugateGradients:
         return max_iterations, LinearStatus.ITERATIONS
 
     def _launch_iteration(self, operator: TangentOperator, preconditioner: Preconditioner, x: wp.array) -> None:
+        operator.apply(self._p, self._q)
+        self._launch_update(preconditioner, x)
+
+    def _launch_update(self, preconditioner: Preconditioner, x: wp.array) -> None:
+        """What follows the product q = A p."""
         r, z, p, q, scalars = self._r, self._z, self._p, self._q, self._scalars
-        operator.apply(p, q)
         self._launch_chunks("curvature", [p, q], [self._parts])
         self._launch_once("choose_step", [self._parts], [scalars])
         self._launch("advance", [p, q, scalars], [x, r])
@@ -224,9 +229,12 @@ class ConjugateGradients:
         parties = operator, preconditioner, x  # held by the graph, so that no other gets their ids
         key = (*map(id, parties), preconditioner.version)
         if self._graph is None or self._graph[0] != key:
+            launch = self._launch_update if operator.divided else partial(self._launch_iteration, operator)
             with wp.ScopedCapture(device=self.model.device) as capture:
-                self._launch_iteration(operator, preconditioner, x)
+                launch(preconditioner, x)
             self._graph = key, parties, capture.graph
+        if operator.divided:
+            operator.apply(self._p, self._q)
         wp.capture_launch(self._graph[2])
 
     def _scalar(self, index: int) -> float:
