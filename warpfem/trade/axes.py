@@ -179,5 +179,12 @@ def default_axes(problem: Problem, mesh: MeshControl) -> list[Axis]:
         axes.append(Axis("solver", tuple(dict.fromkeys((own, "sdirk2")))))
         interval = 1.0 / plain.fps
         dt = interval if plain.dt == "auto" else min(plain.dt, interval)
-        axes.append(Axis("dt", tuple(f"{dt * factor:.6g}" for factor in (2.0, 1.0, 0.5) if dt * factor <= interval)))
+        lengths = [dt * factor for factor in (2.0, 1.0, 0.5)]
+        axes.append(Axis("dt", tuple(_fraction(length) for length in lengths if length <= interval)))
     return axes
+
+
+def _fraction(length: float) -> str:
+    """A time step as 1/n where it is one, so that it divides a frame as exactly as it was meant to."""
+    count = round(1.0 / length)
+    return f"1/{count}" if abs(count * length - 1.0) < 1e-9 else repr(length)

@@ -1,9 +1,9 @@
 """Richardson extrapolation: the limit of a sequence of ever finer solutions, its order and an error band.
 
 Solutions of an error C h^p on three levels h_1 > h_2 > h_3 have differences in the ratio
-(h_1^p - h_2^p) / (h_2^p - h_3^p), which tells p, and the limit u_3 + (u_3 - u_2) / ((h_2 / h_3)^p - 1). (Richardson 1911;
-Roache, "Perspective: a method for uniform reporting of grid refinement studies", 1994.) The error band claims no more of
-it than that it is four times as accurate as the finest level.
+(h_1^p - h_2^p) / (h_2^p - h_3^p), which tells p, and the limit u_3 + (u_3 - u_2) / ((h_2 / h_3)^p - 1) (Richardson
+1911; Roache, "Perspective: a method for uniform reporting of grid refinement studies", 1994). The error band claims no
+more of it than that it is four times as accurate as the finest level.
 """
 
 from __future__ import annotations

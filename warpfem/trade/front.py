@@ -19,6 +19,10 @@ RESOLVED = 0.25
 """The largest part of an error that the reference's band may be for the error to be more than a bound."""
 
 
+TAIL = 30.0
+"""Errors over the smallest one of a front that belong to the part that is extrapolated."""
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A setting with its cost and its error.
@@ -76,8 +80,8 @@ class Answer:
         refusal: why there is no answer; empty if there is one.
         candidate: the cheapest setting within the error; ``None`` if none is.
         closest: the most accurate setting, where none is.
-        next_seconds: time of a setting within a tenth of the error [s]; where none is within the error, of one within it;
-            ``None`` if the front does not tell.
+        next_seconds: time of a setting within a tenth of the error [s]; where none is within the error, of one within
+            it; ``None`` if the front does not tell.
         next_how: whether that was measured or extrapolated along the front.
     """
 
@@ -102,8 +106,8 @@ class Answer:
         if self.candidate is None:
             assert self.closest is not None
             return (
-                f"No setting of the sweep is within {asked}: the most accurate, {self.closest.point.setting.label}, is off "
-                f"by {percent(self.closest.error)} (± {percent(self.closest.band)}) and takes "
+                f"No setting of the sweep is within {asked}: the most accurate, {self.closest.point.setting.label}, is "
+                f"off by {percent(self.closest.error)} (± {percent(self.closest.band)}) and takes "
                 f"{self.closest.seconds:.2g} s; to get there: {price}"
             )
         own = self.candidate
@@ -134,11 +138,8 @@ def answer(ordered: Sequence[Candidate], reference: Reference, name: str, target
     within = [own for own in ordered if own.bound <= target]
     goal = target / NEXT if within else target
     measured = [own for own in ordered if own.bound <= goal]
-    how: Literal["measured", "extrapolated", ""]
-    if measured:
-        seconds, how = measured[0].seconds, "measured"
-    else:
-        seconds, how = _extrapolated(edge, goal), "extrapolated"
+    seconds = measured[0].seconds if measured else _extrapolated(edge, goal)
+    how: Literal["measured", "extrapolated", ""] = "measured" if measured else "extrapolated"
     if seconds is None:
         how = ""
     if within:
@@ -158,9 +159,9 @@ def advice(reference: Reference, name: str) -> str:
 
 
 def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
-    """The time at which the front, continued as a power law, comes to an error [s]."""
-    tail = [own for own in edge if own.resolved][-4:]
-    if len(tail) < 2:
+    """The time at which the front, continued as a power law from its last part, comes to an error [s]."""
+    tail = [own for own in edge if own.error <= TAIL * edge[-1].error]
+    if len(tail) < 3:
         return None
     logs = np.log([[own.error, own.seconds] for own in tail])
     slope, _ = np.polyfit(logs[:, 0], logs[:, 1], 1)

@@ -123,26 +123,12 @@ def _legend(axes: Any, own: Sweep, colored: str, marked: str) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D(
-            [],
-            [],
-            color=_style(value, _values(own, colored), COLORS),
-            marker="o",
-            linestyle="",
-            label=f"{colored}={value}",
-        )
-        for value in _values(own, colored)
+        Line2D([], [], color=color, marker="o", linestyle="", label=f"{colored}={value}")
+        for value, color in zip(_values(own, colored), COLORS, strict=False)
     ]
     handles += [
-        Line2D(
-            [],
-            [],
-            color="0.3",
-            marker=_style(value, _values(own, marked), MARKERS),
-            linestyle="",
-            label=f"{marked}={value}",
-        )
-        for value in _values(own, marked)
+        Line2D([], [], color="0.3", marker=marker, linestyle="", label=f"{marked}={value}")
+        for value, marker in zip(_values(own, marked), MARKERS, strict=False)
     ]
     handles.append(Line2D([], [], color="0.3", label="the front"))
     axes.legend(handles=handles, fontsize="small", loc="best")

@@ -1,9 +1,9 @@
 """The reference of a study: finer in space and time than what is asked about, extrapolated, with an error band.
 
-Two ladders of runs, in float64 and with a tight tolerance, of quadratic cells and a scheme of third order: one of meshes
-with a fixed time step, one of time steps with the coarsest of these meshes. Each is extrapolated, and the sum of the
-limit in space and of what is missing in time is the reference. A ladder grows by a level until the reference is four
-times as accurate as the best setting, or the next run would take too long.
+Two ladders of runs, in float64 and with a tight tolerance, of quadratic cells and a scheme of third order: one of
+meshes with a fixed time step, one of time steps with the coarsest of these meshes. Each is extrapolated, and the sum of
+the limit in space and of what is missing in time is the reference. A ladder grows by a level until the reference is
+four times as accurate as the best setting, or the next run would take too long.
 
 Explicit steps are as long as each mesh allows: their errors fall with those of the mesh, and one ladder does.
 """
@@ -67,8 +67,8 @@ class Reference:
 
     Attributes:
         outcome: its motion and quantities.
-        scales: what errors are relative to, by name: the peak over time of the root mean square displacement, the largest
-            displacement [m], and the quantities' own magnitudes.
+        scales: what errors are relative to, by name: the peak over time of the root mean square displacement, the
+            largest displacement [m], and the quantities' own magnitudes.
         parts: error bands by name and by what leaves them: "space", "time" and "algebra".
         ladders: what was run for it, by "space" and "time", from coarse to fine. The first mesh of the one, with the
             last but one step of the other, is the run that both share.
@@ -155,10 +155,9 @@ class _Builder:
     # ---- ladders
 
     def _begin(self) -> None:
-        coarsest = (
-            max(self.asked, key=lambda p: p.first.mesh_size).setting.only(self.mesh.names) if self.asked else None
-        )
-        start = coarsest or Setting()
+        if not self.asked:
+            raise SimulationError("there is no reference: every setting failed")
+        start = max(self.asked, key=lambda point: point.first.mesh_size).setting.only(self.mesh.names)
         for element in ("quadratic", "linear"):
             base = start.changed(**{f"{FORCED}element": element})
             steps = self._first_steps()
@@ -178,13 +177,13 @@ class _Builder:
         self.time = rungs[: len(settings)]
         self.space = [self.time[-2], *rungs[len(settings) : len(settings) + len(meshes)]]
         self.algebra = rungs[-1].outcome if self.implicit else None
-        if len(self.space) < 2 or len(self.space) < 3 and not self._grow("space"):
+        if len(self.space) < 2 or (len(self.space) < 3 and not self._grow("space")):
             self.remarks.append("the meshes for an observed order would take too long")
         if len(self.space) < 2:
             raise SimulationError("there is no reference: " + "; ".join(self.remarks))
 
     def _first_steps(self) -> list[int]:
-        """Steps of a frame of the first ladder in time; of explicit schemes two equal ones, of the length they choose."""
+        """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh."""
         if not self.implicit:
             return [0, 0]
         interval = 1.0 / self.study.scene.fps
