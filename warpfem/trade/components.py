@@ -111,7 +111,9 @@ class _Explicit(_Separator):
         super().__init__(study, reference, point)
         self.order = solver.order
         self.halved = point.setting.changed(**{f"{FORCED}dt": repr(0.5 * point.first.shortest_dt)})
-        self.algebra = point.setting.changed(dtype="float64")
+        self.algebra = point.setting.changed(
+            **(FINE_ALGEBRA if isinstance(solver, ImplicitSolver) else {"dtype": "float64"})
+        )
 
     def needed(self) -> list[Setting]:
         return [self.halved, self.algebra]

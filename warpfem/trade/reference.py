@@ -103,38 +103,51 @@ def relative(own: Difference, scales: dict[str, float]) -> dict[str, float]:
     return {name: absolute[name] / scale for name, scale in scales.items() if name in absolute and scale > 0.0}
 
 
-def build_reference(study: Study, mesh: MeshControl, asked: Sequence[Point], name: str = L2) -> Reference:
+def build_reference(
+    study: Study,
+    mesh: MeshControl,
+    asked: Sequence[Point],
+    name: str = L2,
+    *,
+    within: float | None = None,
+    explicit: bool | None = None,
+) -> Reference:
     """The reference of settings that have been run.
 
     Args:
         study: runs what the ladders need.
         mesh: makes meshes finer.
-        asked: the settings that it has to be more accurate than.
+        asked: the settings that it has to be more accurate than; the ladders begin with the coarsest of their meshes.
         name: of what: a norm, or a quantity of the scene.
+        within: the error band to reach; ``None`` for a part of the best setting's error.
+        explicit: whether its runs take explicit steps; ``None`` as the scene does.
 
     Raises:
         SimulationError: no ladder of two levels could be run.
     """
-    return _Builder(study, mesh, [point for point in asked if not point.failure]).build(name)
+    if explicit is None:
+        explicit = not isinstance(study.scene.solver, ImplicitSolver)
+    builder = _Builder(study, mesh, [point for point in asked if not point.failure], implicit=not explicit)
+    return builder.build(name, within)
 
 
 class _Builder:
-    def __init__(self, study: Study, mesh: MeshControl, asked: Sequence[Point]) -> None:
+    def __init__(self, study: Study, mesh: MeshControl, asked: Sequence[Point], *, implicit: bool) -> None:
         self.study = study
         self.mesh = mesh
         self.asked = asked
-        self.implicit = isinstance(study.scene.solver, ImplicitSolver)
+        self.implicit = implicit
         self.remarks: list[str] = []
         self.space: list[Rung] = []
         self.time: list[Rung] = []
         self.algebra: Outcome | None = None
 
-    def build(self, name: str) -> Reference:
+    def build(self, name: str, within: float | None) -> Reference:
         self._begin()
         while True:
             reference = self._reference()
             best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
-            need = best / MARGIN
+            need = best / MARGIN if within is None else within
             parts = reference.parts.get(name)
             if parts is None:
                 known = ", ".join(reference.names)

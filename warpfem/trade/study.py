@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -115,6 +115,17 @@ class Study:
         self.scene = problem.build(Setting()).scene
         share = max(1, PLACES // len(self.scene.bodies))
         self.places = [spread_places(body.mesh, share) for body in self.scene.bodies]
+
+    def shortened(self, frames: int) -> Study:
+        """The same study of the first frames alone."""
+        return self._like(replace(self.problem, frames=frames), self.load, self.threads)
+
+    def alone(self) -> Study:
+        """The same study, one run after the other if each is asked for alone."""
+        return self._like(self.problem, "serial", None)
+
+    def _like(self, problem: Problem, load: Load, threads: int | None) -> Study:
+        return Study(problem, self.store, self._executor, load=load, limit=self.limit, threads=threads, say=self.say)
 
     def run(self, settings: Sequence[Setting], repeats: int = 1, *, limit: float | None = None) -> list[Point]:
         """Runs settings, round after round, so that slow changes of the machine's speed show in the spread.
