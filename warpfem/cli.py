@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shlex
 import signal
 import sys
 import time
@@ -140,6 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     explain.set_defaults(command=_explain)
 
     _trade_parser(commands)
+    _tune_parser(commands)
 
     preview = commands.add_parser("preview", help="draw a run to PNG or GIF", description=_preview.__doc__)
     preview.add_argument("file", type=Path, metavar="FILE", help="a USD file that warpfem wrote")
@@ -173,10 +175,7 @@ def _trade_parser(commands: Any) -> None:
     trade = commands.add_parser(
         "trade", help="measure what accuracy costs in a scene, setting by setting", description=_trade.__doc__
     )
-    trade.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
-    _set_option(trade)
-    trade.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
-    trade.add_argument("--frames", type=_positive, metavar="N", help="frames to simulate after the initial one")
+    _study_options(trade)
     trade.add_argument(
         "--axis",
         action="append",
@@ -197,21 +196,7 @@ def _trade_parser(commands: Any) -> None:
         "0.1%%)",
     )
     trade.add_argument(
-        "--quantity",
-        default="l2",
-        metavar="Q",
-        help="what the error is of: a quantity that the scene declares, or l2 or max, the norms of the motion "
-        "(default: %(default)s)",
-    )
-    trade.add_argument(
         "--repeats", type=_positive, default=3, metavar="N", help="processes that time each setting (default: 3)"
-    )
-    trade.add_argument(
-        "--limit",
-        type=_positive,
-        default=300,
-        metavar="SECONDS",
-        help="wall time after which a setting has failed, also one of the reference (default: %(default)s)",
     )
     where = trade.add_mutually_exclusive_group()
     where.add_argument(
@@ -230,6 +215,47 @@ def _trade_parser(commands: Any) -> None:
     )
     trade.add_argument("--json", action="store_true", help="print the results as JSON, and nothing else")
     trade.set_defaults(command=_trade)
+
+
+def _tune_parser(commands: Any) -> None:
+    tune = commands.add_parser(
+        "tune", help="find the cheapest setting of a scene within an error", description=_tune.__doc__
+    )
+    _study_options(tune)
+    tune.add_argument("--error", type=_error, required=True, metavar="E", help="relative error, as 1%% or 0.01")
+    tune.add_argument(
+        "--workers",
+        type=_positive,
+        default=1,
+        metavar="N",
+        help="settings that are tried at the same time on this machine; what is found is timed alone",
+    )
+    tune.add_argument(
+        "--out", type=Path, metavar="FILE", help="file of the settings (default: output/SCENE.settings.toml)"
+    )
+    tune.add_argument("--json", action="store_true", help="print the result as JSON, and nothing else")
+    tune.set_defaults(command=_tune)
+
+
+def _study_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
+    _set_option(parser)
+    parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
+    parser.add_argument("--frames", type=_positive, metavar="N", help="frames to simulate after the initial one")
+    parser.add_argument(
+        "--quantity",
+        default="l2",
+        metavar="Q",
+        help="what the error is of: a quantity that the scene declares, or l2 or max, the norms of the motion "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--limit",
+        type=_positive,
+        default=300,
+        metavar="SECONDS",
+        help="wall time after which a setting has failed, also one of the reference (default: %(default)s)",
+    )
 
 
 def _error(text: str) -> float:
@@ -255,8 +281,12 @@ _positive.__name__ = "number"  # argparse's name for what is no number
 def _scene_options(parser: argparse.ArgumentParser, dtype: FloatName = "float32") -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
     parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
-    parser.add_argument("--dtype", choices=("float32", "float64"), default=dtype, help=f"default: {dtype}")
+    parser.add_argument("--dtype", choices=("float32", "float64"), help=f"default: {dtype}")
+    parser.set_defaults(default_dtype=dtype)
     _set_option(parser)
+    parser.add_argument(
+        "--settings", type=Path, metavar="F", help="file that warpfem tune wrote; --set and other options win over it"
+    )
 
 
 def _set_option(parser: argparse.ArgumentParser) -> None:
@@ -264,7 +294,7 @@ def _set_option(parser: argparse.ArgumentParser) -> None:
         "--set",
         action="append",
         default=[],
-        dest="settings",
+        dest="parameters",
         metavar="NAME=VALUE",
         help="set a parameter of the scene; may be repeated",
     )
@@ -278,20 +308,29 @@ def _time_options(parser: argparse.ArgumentParser) -> None:
 def _load(arguments: argparse.Namespace) -> Scene:
     from warpfem.scene_file import load_scene
 
-    scene = load_scene(arguments.scene, _parameters(arguments))
+    given_parameters = _parameters(arguments)
+    dtype = arguments.default_dtype
+    if arguments.settings is None:
+        scene = load_scene(arguments.scene, given_parameters)
+    else:
+        from warpfem.trade.settings_file import SettingsFile
+
+        choice = SettingsFile.read(arguments.settings).choose(arguments.settings, arguments.scene, given_parameters)
+        scene, dtype = choice.scene, choice.dtype
+    arguments.dtype = arguments.dtype or dtype
     given = {"frames": arguments.frames, "fps": arguments.fps}
     return replace(scene, **{name: value for name, value in given.items() if value is not None})
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, str]:
     """What --set gives."""
-    settings = {}
-    for text in arguments.settings:
+    parameters = {}
+    for text in arguments.parameters:
         name, equals, value = text.partition("=")
         if not equals or not name.isidentifier():
             raise WarpfemError(f"--set takes NAME=VALUE, for example --set cells=16, not '{text}'")
-        settings[name] = value
-    return settings
+        parameters[name] = value
+    return parameters
 
 
 def _start_warp() -> None:
@@ -400,9 +439,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _recipe(arguments: argparse.Namespace) -> str:
-    """What makes the scene: the file and the parameters."""
-    contents = hashlib.sha256(arguments.scene.read_bytes()).hexdigest()
-    return " ".join([contents, *arguments.settings])
+    """What makes the scene: its file, that of the settings and the parameters."""
+    files = [arguments.scene, *([] if arguments.settings is None else [arguments.settings])]
+    contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    return " ".join([*contents, *arguments.parameters])
 
 
 def _require_consent(out: Path) -> None:
@@ -523,6 +563,7 @@ def _static(arguments: argparse.Namespace) -> int:
 
     _start_warp()
     solver = StaticEquilibrium(arguments.tolerance, load_steps=arguments.load_steps)
+    arguments.dtype = arguments.dtype or arguments.default_dtype  # that of settings is meant for time steps
     scene = _load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.static.usdc"
     with _held_interrupt() as check_interrupt:
@@ -626,6 +667,59 @@ def _trade(arguments: argparse.Namespace) -> int:
         print(report.text(done))
         print(f"wrote {', '.join(map(str, written))}")
     return FAILED if done.reference is None or any(answer.refusal for answer in done.answers) else OK
+
+
+def _tune(arguments: argparse.Namespace) -> int:
+    """Finds the cheapest setting of a scene within an error - mesh, cells, time steps, scheme, precision -, and writes
+    it to a file that `warpfem run SCENE --settings FILE` takes.
+
+    Settings are tried on the first half of the frames, and what is found is verified on the others, against a reference
+    that is finer in space and time; without one that is accurate enough the search is refused. Runs are kept in
+    output/SCENE.trade, where those of `warpfem trade` are, and not repeated.
+    """
+    from warpfem.trade import tuning_report
+    from warpfem.trade.axes import mesh_control
+    from warpfem.trade.executors import local_executor
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.store import Store
+    from warpfem.trade.study import Study
+    from warpfem.trade.sweep import require_quantity
+    from warpfem.trade.tune import tune
+
+    _start_warp()
+    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
+    mesh = mesh_control(problem)
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.settings.toml"
+    _make_writable(out)
+    say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
+    alone = arguments.workers == 1
+    with local_executor(arguments.workers) as pool:
+        study = Study(
+            problem,
+            Store(Path("output") / f"{arguments.scene.stem}.trade"),
+            pool,
+            load="serial" if alone else "parallel",
+            limit=float(arguments.limit),
+            threads=None if alone else 1,
+            say=say,
+        )
+        require_quantity(study, arguments.quantity)
+        found = tune(study, mesh, arguments.quantity, arguments.error)
+    tuning_report.write(found, study, out, _tune_command(arguments))
+    if arguments.json:
+        print(json.dumps(tuning_report.data(found, study), indent=2, allow_nan=False))
+    else:
+        print(tuning_report.text(found))
+        print(f"wrote {out}")
+    return OK
+
+
+def _tune_command(arguments: argparse.Namespace) -> str:
+    """The command as one would write it, without what does not bear on its result."""
+    given = [f"--set {text}" for text in arguments.parameters]
+    given += [] if arguments.frames is None else [f"--frames {arguments.frames}"]
+    given += [] if arguments.quantity == "l2" else [f"--quantity {shlex.quote(arguments.quantity)}"]
+    return " ".join(["warpfem tune", str(arguments.scene), f"--error {arguments.error:g}", *given])
 
 
 def _preview(arguments: argparse.Namespace) -> int:

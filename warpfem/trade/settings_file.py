@@ -71,7 +71,7 @@ class SettingsFile:
             if not isinstance(value, kind):
                 raise SceneError(f"{path}: {name} must be {'a text' if kind is str else f'a table [{name}]'}")
         if "scene" not in data:
-            raise SceneError(f"{path}: the name of the scene is missing, as in scene = \"beam.py\"")
+            raise SceneError(f'{path}: the name of the scene is missing, as in scene = "beam.py"')
         tables = {name: {key: _text(path, key, v) for key, v in data.get(name, {}).items()} for name in TABLES}
         return cls(data["scene"], data.get("digest", ""), **tables, notes={n: data[n] for n in NOTES if n in data})
 
@@ -108,7 +108,7 @@ class SettingsFile:
         Raises:
             SceneError: the settings are not for this scene, or it has no such settings.
         """
-        problem = Problem.of(scene, self.parameters | given)
+        problem = Problem.of(scene, self.parameters | dict(given))
         if problem.digest != self.digest:
             if Path(scene).name != self.scene:
                 raise SceneError(f"{path} has settings of {self.scene}, not of {scene}")

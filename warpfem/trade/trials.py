@@ -157,7 +157,9 @@ def _step(tried: Sequence[Trial], resolution: Callable[[Trial], float], goal: fl
     """How much finer than the last level the next one shall be."""
     last, p = tried[-1], order
     if len(tried) > 1 and math.isfinite(tried[-2].error) and resolution(last) > resolution(tried[-2]):
-        observed = math.log(tried[-2].error / max(last.error, TINY)) / math.log(resolution(last) / resolution(tried[-2]))
+        observed = math.log(tried[-2].error / max(last.error, TINY)) / math.log(
+            resolution(last) / resolution(tried[-2])
+        )
         p = min(max(observed, 0.6 * order), 1.5 * order)
     return min(max((last.error / (AIM * goal)) ** (1.0 / p), LEAST_FACTOR), MOST_FACTOR)
 

@@ -1,16 +1,16 @@
 """Finds the cheapest setting of a scene within an error, without trying all.
 
 1. A reference is built whose error band is a part of the error asked for, or the search is refused.
-2. On the first part of the frames settings are tried, by one-level changes: how fine a mesh each kind of cells needs with
-   explicit steps; which implicit schemes take steps so long that they are cheaper, on a coarse mesh; and how fine a mesh
-   those need. The share of the error that is left to time is that at which one per cent of error costs the same in space
+2. On the first part of the frames settings are tried, by one-level changes: how fine a mesh each kind of cells needs
+   with explicit steps; which implicit schemes take steps so long that they are cheaper, on a coarse mesh; and how fine
+   a mesh those need. The share of the error that is left to time is that at which less of it costs the same in space
    and in time.
-3. The cheapest ones are run to the end. The frames that the search has not seen show whether they hold; if they do not,
-   or are far more accurate than asked, the search is repeated for a smaller or larger error.
-4. Of the one that is left, tolerance and precision are loosened or tightened as its algebraic error allows.
+3. The cheapest ones are run to the end. The frames that the search has not seen show whether they hold; if they do
+   not, or are far more accurate than asked, the search is repeated for a smaller or larger error.
+4. Of the one that is left the tolerance is loosened, as far as that makes it faster and its error allows it.
 
-Linear elasticity takes the place of another law only where the difference that it makes on a coarse mesh is a small part
-of the error asked for, and where it is faster.
+Linear elasticity takes the place of another law only where the difference that it makes on a coarse mesh is a small
+part of the error asked for, and where it is faster. Other models, such as plane strain, are a scene's own to offer.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ CONTENDERS = 3
 """Settings that are run to the end in each round."""
 
 PROMISING = 1.6
-"""Times the cost of the cheapest up to which a setting is run to the end: half of the frames tell its cost that well."""
+"""Times the cost of the cheapest up to which a setting is run to the end: part of the frames tell it that well."""
 
 ORDERS = {"linear": 2.0, "averaged": 2.0, "quadratic": 3.0}
 """Expected orders in space of the displacement."""
@@ -105,8 +105,8 @@ class Tuned:
         setting: the setting.
         point: its runs, one at a time, over all frames.
         error: relative, over all frames, against the reference.
-        seen, unseen: relative errors over the frames on which it was chosen, and over the others; ``None`` of quantities
-            of the whole motion.
+        seen, unseen: relative errors over the frames on which it was chosen, and over the others; ``None`` of
+            quantities of the whole motion.
         frames: how many frames, after the initial one, it was chosen on.
         reference: what errors are against.
         parts: of its error, by "space", "time", "algebra" and "model".
@@ -222,7 +222,8 @@ class _Tuner:
         return with_steps(base.changed(**FINE_ALGEBRA, **{f"{FORCED}solver": "sdirk3"}), self.fps, 2)
 
     def _accurate_reference(self) -> Reference:
-        self.study.say(f"a reference for {percent(self.target)}, by {'explicit' if self.explicit else 'implicit'} steps")
+        how = "explicit" if self.explicit else "implicit"
+        self.study.say(f"a reference for {percent(self.target)}, by {how} steps")
         (start,) = self.study.solve([self._fine(self.explicit)])
         reference = build_reference(
             self.study, self.mesh, [start], self.name, within=PRECISE * self.target, explicit=self.explicit
@@ -232,8 +233,8 @@ class _Tuner:
         band = reference.band(self.name)
         if not band <= RESOLVED * self.target:
             raise SimulationError(
-                f"no setting can be told to be within {percent(self.target)} of {label(self.name)}: the reference itself "
-                f"may be off by {percent(band)}. {advice(reference, self.name)}"
+                f"no setting can be told to be within {percent(self.target)} of {label(self.name)}: the reference "
+                f"itself may be off by {percent(band)}. {advice(reference, self.name)}"
             )
         return reference
 
@@ -259,7 +260,7 @@ class _Tuner:
         return self.reference.outcome
 
     def _linear_error(self) -> float:
-        """The difference that linear elasticity makes on the coarse mesh; infinite if it cannot take the laws' place."""
+        """The difference that linear elasticity makes on the coarse mesh; infinite where it cannot be had."""
         materials = [body.material for body in self.scene.bodies]
         own = all(isinstance(material, HookeanMaterial) for material in materials)
         if not own or all(isinstance(material, LinearElasticity) for material in materials):
@@ -387,8 +388,8 @@ class _Tuner:
     def _loosened(self, winner: Trial) -> Trial:
         """The setting with the largest tolerance that is within the error and makes it faster."""
         solver = self.study.problem.build(winner.setting).scene.solver
-        if not isinstance(solver, ImplicitSolver) or solver.max_iterations == 1 or f"{FORCED}tolerance" in winner.setting:
-            return winner
+        if not isinstance(solver, ImplicitSolver) or solver.max_iterations == 1:
+            return winner  # there is no tolerance
         for factor in (10.0, 100.0):
             trial = self.whole.one(winner.setting.changed(**{f"{FORCED}tolerance": f"{factor * solver.tolerance:g}"}))
             if not (trial.error + self.band <= self.target and trial.seconds < FASTER * winner.seconds):
@@ -399,8 +400,9 @@ class _Tuner:
     def _elements(self) -> list[str]:
         """The kinds of cells that are tried."""
         materials = [body.material for body in self.scene.bodies]
-        soft = any(isinstance(m, HookeanMaterial) and np.max(m.nu) >= NEARLY_INCOMPRESSIBLE for m in materials)
-        return ["linear", "quadratic", *(["averaged"] if soft else [])]
+        nus = [np.max(np.asarray(own.nu, dtype=np.float64)) for own in materials if isinstance(own, HookeanMaterial)]
+        averaged = max(nus, default=0.0) >= NEARLY_INCOMPRESSIBLE
+        return ["linear", "quadratic", *(["averaged"] if averaged else [])]
 
     def _schemes(self) -> list[str]:
         """The implicit schemes that are tried."""
