@@ -16,7 +16,7 @@ part of the error asked for, and where it is faster. Other models, such as plane
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -308,8 +308,7 @@ class _Tuner:
         self.study.say(f"settings within {percent(goal)} on the first {self.frames} frames")
         found: list[Trial] = []
         if self.explicit:
-            bases = [Setting.of(**EXPLICIT, **{f"{FORCED}element": element}) for element in self._elements()]
-            for base in bases:
+            for base in self._by_promise([_with(EXPLICIT, element) for element in self._elements()], goal):
                 self._add(found, base, goal)
         levels = [level for level in self._time_levels(goal, found) if level is not None]
         for level in sorted(levels, key=lambda t: t.seconds):
@@ -317,19 +316,33 @@ class _Tuner:
                 expected = level.seconds * max(1.0, self._growth(element))
                 if expected <= PROMISING * _least(found):
                     base = level.setting.only({name for name, _ in level.setting} - self.mesh.names)
-                    self._add(found, base.changed(**{f"{FORCED}element": element}), goal)
+                    self._add(found, _with(dict(base), element), goal)
         found.sort(key=lambda t: t.seconds)
         found += self._linear(found[:1], goal)
         found.sort(key=lambda t: t.seconds)
         return [trial for trial in found if trial.seconds <= PROMISING * found[0].seconds][:CONTENDERS]
 
+    def _by_promise(self, bases: Sequence[Setting], goal: float) -> list[Setting]:
+        """Kinds of cells in the order of what the goal may cost with them, by their first mesh."""
+
+        def cost(trial: Trial, base: Setting) -> float:
+            power = (self.scene.dim + 0.5) / ORDERS[base[f"{FORCED}element"]]
+            return trial.seconds * max(1.0, trial.error / goal) ** power
+
+        firsts = self.early.run([self._start(base) for base in bases])
+        costs = [cost(first, base) for first, base in zip(firsts, bases, strict=True)]
+        return [bases[k] for k in np.argsort(costs, kind="stable")]
+
+    def _start(self, base: Setting) -> Setting:
+        """The setting with the mesh that its kind of cells begins with: what it has needed so far, or a coarse one."""
+        return base.changed(**dict(self.starts.get(base[f"{FORCED}element"]) or coarser(self.mesh, Setting(), 2)))
+
     def _add(self, found: list[Trial], base: Setting, goal: float) -> None:
         """Adds the coarsest mesh that is within the goal, if there is one at a cost that is of interest."""
         element = base[f"{FORCED}element"]
-        start = self.starts.get(element) or coarser(self.mesh, Setting(), 2)
         trial = coarsest_within(
             self.early.one,
-            base.changed(**dict(start)),
+            self._start(base),
             self.mesh.finer,
             lambda own: 1.0 / own.outcome.mesh_size,
             goal=goal,
@@ -420,6 +433,10 @@ def coarser(mesh: MeshControl, setting: Setting, factor: int) -> Setting:
             return found
         factor //= 2
     return setting
+
+
+def _with(values: Mapping[str, str], element: str) -> Setting:
+    return Setting.of(**{**values, f"{FORCED}element": element})
 
 
 def _least(found: Sequence[Trial]) -> float:

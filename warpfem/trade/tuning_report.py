@@ -117,6 +117,6 @@ def _reference(reference: Reference, name: str) -> dict[str, Any]:
         if part.order is not None:
             found[f"order_in_{kind}"] = part.order
     for kind, rungs in reference.ladders.items():
-        if rungs:
+        if kind in reference.parts[name]:
             found[f"finest_in_{kind}"] = _label(rungs[-1].setting)
     return found
