@@ -152,17 +152,21 @@ class Body:
         return replace(term, points=self.mesh.with_midpoints(members))
 
     def refined(self) -> Body:
-        """The body with each of its cells divided into 4 (2D) or 8 (3D); forces on points stay where they are."""
+        """The body with each of its cells divided into 4 (2D) or 8 (3D).
+
+        Forces on points stay where they are, and initial values that are arrays are interpolated linearly.
+        """
         mesh = self.mesh
         parts = len(mesh.quadratic().shape.parts)
 
         def per_point(value: PointField | None) -> PointField | None:
-            if value is None or callable(value) or mesh.order == 2:
+            if value is None or callable(value):
                 return value
             array = np.asarray(value)
             if array.ndim == 1:
                 return array
-            return np.concatenate([array, array[mesh.edges].mean(axis=1)])
+            edges = mesh.edges if mesh.order == 1 else mesh.refined().edges  # those that gain a midpoint
+            return np.concatenate([array, array[edges].mean(axis=1)])
 
         def term(own: Term) -> Term:
             if isinstance(own, PointForce):  # on the same points, whatever their set gains

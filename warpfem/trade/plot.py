@@ -8,6 +8,7 @@ from typing import Any
 
 from warpfem.errors import MissingExtraError, OutputError
 from warpfem.trade.front import Candidate, label, percent
+from warpfem.trade.report import failure_lines
 from warpfem.trade.sweep import Sweep
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -16,7 +17,7 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
 MOST_LISTED = 12
-"""Failed settings that are listed by name."""
+"""Reasons of failures that are listed."""
 
 
 def plot(own: Sweep, folder: Path) -> list[Path]:
@@ -139,11 +140,11 @@ def _list(axes: Any, own: Sweep) -> None:
     axes.axis("off")
     lines = [_line(number, candidate) for number, candidate in enumerate(own.front, start=1)]
     if own.failed:
+        reasons = failure_lines(own.failed)
         lines += ["", f"{len(own.failed)} of {len(own.points)} settings failed:"]
-        for point in own.failed[:MOST_LISTED]:
-            lines.append("  " + textwrap.shorten(f"{point.setting.label}: {point.failure}", 118, placeholder=" ..."))
-        if len(own.failed) > MOST_LISTED:
-            lines.append(f"  and {len(own.failed) - MOST_LISTED} more")
+        lines += ["    " + textwrap.shorten(line, 116, placeholder=" ...") for line in reasons[:MOST_LISTED]]
+        if len(reasons) > MOST_LISTED:
+            lines.append(f"    and {len(reasons) - MOST_LISTED} more reasons")
     axes.text(0.0, 1.0, "\n".join(lines), va="top", family="monospace", fontsize=8, transform=axes.transAxes)
 
 

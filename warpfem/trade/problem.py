@@ -157,6 +157,8 @@ class Problem:
             WarpfemError: there is no such setting of this scene.
         """
         own = self.parameter_names()
+        if setting.get("dt") == "auto" and "dt" in own:  # where the parameter is a number
+            return self.build(setting.changed(dt=None).changed(**{f"{FORCED}dt": "auto"}))
         given = dict(self.parameters) | {name: _literal(name, value) for name, value in setting if name in own}
         scene = load_scene(self.path, given)
         rest = {name: value for name, value in setting if name not in own and not name.startswith(FORCED)}

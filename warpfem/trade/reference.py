@@ -140,7 +140,7 @@ class _Builder:
         self.remarks: list[str] = []
         self.space: list[Rung] = []
         self.time: list[Rung] = []
-        self.algebra: Outcome | None = None
+        self.algebra: Outcome | None = None  # with a hundred times the tolerance, which changes more than it does
 
     def build(self, name: str, within: float | None) -> Reference:
         self._begin()
@@ -156,7 +156,7 @@ class _Builder:
                 return reference
             ladders = ["space", "time"] if self.implicit else ["space"]
             ladders.sort(key=lambda kind: -parts[kind].band)
-            if parts["algebra"].band > max(parts[kind].band for kind in ladders):
+            if "algebra" in parts and parts["algebra"].band > max(parts[kind].band for kind in ladders):
                 self.remarks.append("rounding or the tolerance of the solver limits the reference")
                 return self._reference()
             for kind in ladders:
@@ -268,9 +268,10 @@ class _Builder:
             cross = (0.0, 0.0) if kind == "space" else _norms(missing)  # measured on the coarsest mesh
             parts[L2][kind] = Part(own.order, (own.band + CLAIM * cross[0]) / scales[L2], own.remark)
             parts[LARGEST][kind] = Part(own.order, (own.largest_band + CLAIM * cross[1]) / scales[LARGEST], own.remark)
-        rough = self._algebra_difference(bare)
-        parts[L2]["algebra"] = Part(None, rough.l2 / scales[L2])
-        parts[LARGEST]["algebra"] = Part(None, rough.largest / scales[LARGEST])
+        rough = None if self.algebra is None else difference(self.algebra, bare)
+        if rough is not None:
+            parts[L2]["algebra"] = Part(None, rough.l2 / scales[L2])
+            parts[LARGEST]["algebra"] = Part(None, rough.largest / scales[LARGEST])
         quantities = {}
         for name in self._shared_quantities():
             value, scale, parts[name] = self._quantity(name, bare, rough, limits)
@@ -280,18 +281,12 @@ class _Builder:
         ladders = {"space": self.space, "time": self.time}
         return Reference(outcome, scales, parts, ladders, limits, list(self.remarks))
 
-    def _algebra_difference(self, bare: Outcome) -> Difference:
-        """What a hundred times the tolerance changes, which is more than the tolerance does."""
-        if self.algebra is None:
-            return Difference(0.0, 0.0, {})
-        return difference(self.algebra, bare)
-
     def _shared_quantities(self) -> list[str]:
         rungs = [*self.space, *(self.time if self.implicit else ())]
         return [name for name in self.space[0].outcome.quantities if all(name in r.outcome.quantities for r in rungs)]
 
     def _quantity(
-        self, name: str, bare: Outcome, rough: Difference, limits: dict[str, Outcome]
+        self, name: str, bare: Outcome, rough: Difference | None, limits: dict[str, Outcome]
     ) -> tuple[float, float, dict[str, Part]]:
         """The reference's value of a quantity, what its errors are relative to, and the bands."""
 
@@ -314,7 +309,8 @@ class _Builder:
             kind: Part(own.order, (own.band + (CLAIM * abs(cross) if kind == "time" else 0.0)) / scale, own.remark)
             for kind, own in bands.items()
         }
-        parts["algebra"] = Part(None, abs(rough.quantities.get(name, 0.0)) / scale)
+        if rough is not None:
+            parts["algebra"] = Part(None, abs(rough.quantities.get(name, 0.0)) / scale)
         return value, scale, parts
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -42,12 +42,28 @@ def text(own: Sweep) -> str:
     lines = [f"{len(own.points)} settings, {len(own.failed)} of them without result; times are wall time of the steps"]
     if own.study.load == "parallel":
         lines[0] += ", taken while other settings ran: they are longer than those of a run alone"
-    for point in own.failed:
-        lines.append(f"failed: {point.setting.label}: {point.failure}")
+    lines += [f"failed: {line}" for line in failure_lines(own.failed)]
     if own.reference is None:
         return "\n".join([*lines, f"No reference: {own.refusal}"])
     lines += ["", *reference_lines(own.reference, own.name), "", *front_lines(own), ""]
     return "\n".join([*lines, *(answer.sentence for answer in own.answers)])
+
+
+def failure_lines(failed: Sequence[Point]) -> list[str]:
+    """Why settings failed, those that failed for the same reason together."""
+    by_reason: dict[str, list[Point]] = {}
+    for point in failed:
+        by_reason.setdefault(point.failure, []).append(point)
+    return [f"{_shared_label(points)}: {reason}" for reason, points in by_reason.items()]
+
+
+def _shared_label(points: Sequence[Point]) -> str:
+    """What settings have in common, and how many they are."""
+    if len(points) == 1:
+        return points[0].setting.label
+    shared = set.intersection(*(set(point.setting) for point in points))
+    label = " ".join(f"{name}={value}" for name, value in points[0].setting if (name, value) in shared)
+    return f"{len(points)} settings{f' with {label}' if label else ''}"
 
 
 def reference_lines(reference: Reference, name: str) -> list[str]:
