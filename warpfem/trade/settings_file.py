@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import tomllib
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,6 +20,8 @@ TEXTS = ("scene", "digest")
 TABLES = ("parameters", "changes")
 NOTES = ("estimate", "reference", "machine")
 """What a file has: two texts, two tables that are used, and tables that only tell."""
+
+_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?(e[+-]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -88,8 +91,8 @@ class SettingsFile:
         lines = [f"# {remark}" for remark in remarks]
         lines += ["", f"scene = {json.dumps(self.scene)}", f"digest = {json.dumps(self.digest)}"]
         for name, table in ({"parameters": self.parameters, "changes": self.changes} | self.notes).items():
-            values = table if name in self.notes else {key: _plain(value) for key, value in table.items()}
-            lines += ["", f"[{name}]", *(f"{_key(key)} = {_toml(value)}" for key, value in values.items())]
+            write = _toml if name in self.notes else _plain
+            lines += ["", f"[{name}]", *(f"{_key(key)} = {write(value)}" for key, value in table.items())]
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary:
@@ -141,16 +144,9 @@ def _text(path: Path, name: str, value: object) -> str:
     return str(value)
 
 
-def _plain(text: str) -> str | int | float:
-    """A number where the text is one that is read back as the same text."""
-    for kind in (int, float):
-        try:
-            number = kind(text)
-        except ValueError:
-            continue
-        if repr(number) == text and abs(number) < 1e15:
-            return number
-    return text
+def _plain(text: str) -> str:
+    """A number as it is, any other text in quotes."""
+    return text if _NUMBER.fullmatch(text) else _toml(text)
 
 
 def _key(name: str) -> str:

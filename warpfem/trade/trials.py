@@ -14,6 +14,9 @@ from warpfem.trade.study import Point, Study
 AIM = 0.92
 """The part of an error's goal that a search aims at."""
 
+HOPE = 1.1
+"""The part of the goal up to which a coarser level is tried where there is none between."""
+
 CLOSE = 0.8
 """The part of the goal above which a setting that meets it is coarse enough."""
 
@@ -22,6 +25,12 @@ LEAST_FACTOR, MOST_FACTOR = 1.15, 2.5
 
 TINY = 1e-12
 """Errors are none below."""
+
+LARGER = (1.5, 2.0)
+"""What is tried where that is less than one cell."""
+
+STAGNANT = 0.9
+"""The part of an error to which refinement brings it down at least."""
 
 MOST_TRIALS = 8
 """Levels of a search."""
@@ -132,9 +141,9 @@ def coarsest_within(
                 following = finer(following, 2.0) if len(tried) < 3 else None
                 continue
             factor = _step(tried, resolution, goal, order)
-            if trial.seconds * factor**growth > most_seconds:
+            if trial.seconds * factor**growth > most_seconds or _stagnates(tried):
                 return None
-            following = finer(following, factor)
+            following = next(filter(None, (finer(following, own) for own in (factor, *LARGER) if own >= factor)), None)
             continue
         best = min(good, key=resolution)
         if best.error >= CLOSE * goal:
@@ -144,8 +153,8 @@ def coarsest_within(
         if lower:
             last = max(lower, key=resolution)
             p = math.log(last.error / max(best.error, TINY)) / math.log(resolution(best) / resolution(last))
-        factor = max(0.4, (best.error / (AIM * goal)) ** (1.0 / p))
-        following = finer(best.setting, factor)
+        factors = (max(0.4, (best.error / (part * goal)) ** (1.0 / p)) for part in (AIM, HOPE))
+        following = next(filter(None, (finer(best.setting, own) for own in factors)), None)
     good = [t for t in tried if t.error <= goal]
     if not good:
         return None
@@ -153,13 +162,17 @@ def coarsest_within(
     return replace(chosen, setting=chosen.point.setting)
 
 
+def _stagnates(tried: Sequence[Trial]) -> bool:
+    """Whether the last of three levels is hardly more accurate than those before: something else makes the error."""
+    return len(tried) > 2 and tried[-1].error > STAGNANT * min(trial.error for trial in tried[-3:-1])
+
+
 def _step(tried: Sequence[Trial], resolution: Callable[[Trial], float], goal: float, order: float) -> float:
     """How much finer than the last level the next one shall be."""
     last, p = tried[-1], order
     if len(tried) > 1 and math.isfinite(tried[-2].error) and resolution(last) > resolution(tried[-2]):
-        observed = math.log(tried[-2].error / max(last.error, TINY)) / math.log(
-            resolution(last) / resolution(tried[-2])
-        )
+        gain = math.log(tried[-2].error / max(last.error, TINY))
+        observed = gain / math.log(resolution(last) / resolution(tried[-2]))
         p = min(max(observed, 0.6 * order), 1.5 * order)
     return min(max((last.error / (AIM * goal)) ** (1.0 / p), LEAST_FACTOR), MOST_FACTOR)
 

@@ -33,7 +33,7 @@ from warpfem.trade.outcome import Outcome
 from warpfem.trade.problem import FORCED, LINEARISED, Setting
 from warpfem.trade.reference import FINE_ALGEBRA, L2, LARGEST, Reference, build_reference, relative
 from warpfem.trade.study import Point, Study, difference
-from warpfem.trade.trials import AIM, Trial, Trials, coarsest_within, finer_in_time, steps_of, with_steps
+from warpfem.trade.trials import AIM, TINY, Trial, Trials, coarsest_within, finer_in_time, steps_of, with_steps
 
 PRECISE = 0.1
 """The error band of the reference that is aimed at, as a part of the error asked for."""
@@ -175,6 +175,7 @@ class _Tuner:
         self.points: dict[str, int] = {}  # that each kind of cells has needed
         self.starts: dict[str, Setting] = {}  # the meshes that have
         self.linear_error = self._linear_error()
+        self.failed: set[Setting] = set()  # what could not be run to the end
 
     def tune(self, repeats: int) -> Tuned:
         winner, ended = self._search()
@@ -272,29 +273,35 @@ class _Tuner:
 
     def _search(self) -> tuple[Trial, dict[Setting, Trial]]:
         """The cheapest setting that is within the error over all frames, and all that were run over all."""
-        goal = SAFE * (self.target - self.band)
+        limit = self.target - self.band
+        goal = SAFE * limit
         ended: dict[Setting, Trial] = {}
         holding: list[Trial] = []
         for _ in range(SEARCHES):
-            found = self._contenders(goal)
-            new = [trial.setting for trial in found if trial.setting not in ended]
-            if not new:
+            found = [trial for trial in self._contenders(goal) if trial.setting not in ended]
+            if not found:
                 break
-            last = self.whole.run(new)
+            last = self.whole.run([trial.setting for trial in found])
             ended |= {trial.setting: trial for trial in last}
-            held = [trial for trial in last if trial.error + self.band <= self.target]
-            missed = bool(holding) and not held
-            holding += held
-            if missed:
+            # the goal at which each would be just within the error, if the rest of the frames is as much harder for all
+            just = {
+                own.setting: AIM * early.error * limit / max(own.error, TINY)
+                for early, own in zip(found, last, strict=True)
+                if not own.point.failure
+            }
+            self.failed |= {own.setting for own in last if own.point.failure}
+            held = [trial for trial in last if trial.error <= limit]
+            if holding and not held:
                 break
-            if holding:
-                best = min(holding, key=lambda t: t.seconds)
-                if best.error >= SLACK * self.target:
-                    break
-                goal *= min(AIM * self.target / max(best.error, 1e-9), MOST_RELAXED)
-            else:
-                least = min(trial.error for trial in last)
-                goal *= AIM * (self.target - self.band) / least if math.isfinite(least) else 0.5
+            holding += held
+            if not holding:
+                goal = min(just.values(), default=goal)
+                continue
+            best = min(holding, key=lambda t: t.seconds)
+            relaxed = min(just.get(best.setting, 0.0), MOST_RELAXED * goal)
+            if best.error >= SLACK * self.target or relaxed <= goal:
+                break
+            goal = relaxed
         if not holding:
             tried = "; ".join(f"{t.setting.label} is off by {percent(t.error)}" for t in ended.values())
             raise SimulationError(
@@ -317,7 +324,7 @@ class _Tuner:
                 if expected <= PROMISING * _least(found):
                     base = level.setting.only({name for name, _ in level.setting} - self.mesh.names)
                     self._add(found, _with(dict(base), element), goal)
-        found.sort(key=lambda t: t.seconds)
+        found = sorted((t for t in found if t.setting not in self.failed), key=lambda t: t.seconds)
         found += self._linear(found[:1], goal)
         found.sort(key=lambda t: t.seconds)
         return [trial for trial in found if trial.seconds <= PROMISING * found[0].seconds][:CONTENDERS]
