@@ -161,8 +161,7 @@ class _Tuner:
         frames = int(self.scene.frames)
         divided = name in (L2, LARGEST) and frames >= FEWEST_FRAMES
         self.frames = math.ceil(PART * frames) if divided else frames
-        self.coarsest = coarser(mesh, Setting(), 4)
-        self.explicit = self._prefers_explicit()
+        self.coarsest, self.explicit = self._beginning()
         self.reference = self._accurate_reference()
         self.band = self.reference.band(name)
         first = self.reference.ladders["space"][0]
@@ -205,19 +204,27 @@ class _Tuner:
 
     # ---- the reference
 
-    def _prefers_explicit(self) -> bool:
-        """Whether explicit steps make the cheaper reference."""
-        (point,) = self.study.solve([self._fine(explicit=True)])
-        if point.failure:
-            return False
-        if point.seconds < CHEAP:
-            return True
-        (other,) = self.study.solve([self._fine(explicit=False)])
-        return bool(other.failure) or point.seconds < FAVOUR * other.seconds
+    def _beginning(self) -> tuple[Setting, bool]:
+        """The coarsest mesh of the reference, and whether explicit steps make it cheaper.
 
-    def _fine(self, explicit: bool) -> Setting:
-        """The coarsest mesh of quadratic cells, accurate in time."""
-        base = self.coarsest.changed(**{f"{FORCED}element": "quadratic"})
+        Raises:
+            SimulationError: no mesh can be run.
+        """
+        for factor in (4, 2, 1):
+            mesh = coarser(self.mesh, Setting(), factor)
+            (point,) = self.study.solve([self._fine(mesh, explicit=True)])
+            if not point.failure and point.seconds < CHEAP:
+                return mesh, True
+            (other,) = self.study.solve([self._fine(mesh, explicit=False)])
+            if not point.failure:
+                return mesh, bool(other.failure) or point.seconds < FAVOUR * other.seconds
+            if not other.failure:
+                return mesh, False
+        raise SimulationError(f"there is no reference: {other.failure}")
+
+    def _fine(self, mesh: Setting, explicit: bool) -> Setting:
+        """A mesh of quadratic cells, accurate in time."""
+        base = mesh.changed(**{f"{FORCED}element": "quadratic"})
         if explicit:
             return base.changed(dtype="float64", **EXPLICIT)
         return with_steps(base.changed(**FINE_ALGEBRA, **{f"{FORCED}solver": "sdirk3"}), self.fps, 2)
@@ -225,12 +232,12 @@ class _Tuner:
     def _accurate_reference(self) -> Reference:
         how = "explicit" if self.explicit else "implicit"
         self.study.say(f"a reference for {percent(self.target)}, by {how} steps")
-        (start,) = self.study.solve([self._fine(self.explicit)])
+        (start,) = self.study.solve([self._fine(self.coarsest, self.explicit)])
         reference = build_reference(
             self.study, self.mesh, [start], self.name, within=PRECISE * self.target, explicit=self.explicit
         )
-        if self.name not in reference.names:
-            raise SimulationError(f"the reference has no value of '{self.name}'")
+        if not reference.scales[self.name] > 0.0:
+            raise SimulationError(f"the reference has 0 for {label(self.name)}: no error is relative to that")
         band = reference.band(self.name)
         if not band <= RESOLVED * self.target:
             raise SimulationError(
