@@ -27,7 +27,7 @@ from warpfem.trade.reference import Part, Reference, build_reference
 from warpfem.trade.store import Store
 from warpfem.trade.study import Point, Study, difference
 
-BAR = '''
+BAR = """
 import warpfem as wf
 
 def scene(cells: int = 2, E: float = 1e5, dt: float = 1 / 40, kind: str = "soft") -> wf.Scene:
@@ -36,7 +36,7 @@ def scene(cells: int = 2, E: float = 1e5, dt: float = 1 / 40, kind: str = "soft"
     tip = wf.quantities.final_displacement("bar", at=(2, 0.5), axis=1)
     return wf.Scene([bar], wf.BackwardEuler(), dt=dt, gravity=(0, -1), damping=5.0, fps=20, frames=8,
                     quantities={"tip": tip})
-'''
+"""
 
 
 @pytest.fixture
@@ -179,7 +179,7 @@ def test_the_limit_of_a_power_law_is_found_and_its_order(p):
     assert found.order == pytest.approx(p, rel=1e-6)
     np.testing.assert_allclose(found.value, [[2.0, -1.0]], rtol=1e-6)
     missing = 0.3**p * np.hypot(0.7, 0.2)
-    assert found.band == pytest.approx(0.25 * missing, rel=1e-6)  # no more is claimed
+    assert found.band == pytest.approx(0.5 * missing, rel=1e-6)  # no more is claimed
 
 
 @pytest.mark.parametrize(
@@ -341,10 +341,8 @@ def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_proce
     settings = [Setting.of(cells=1, element="P2", dt="1/20"), Setting.of(cells=2, element="P1", dt="1/20")]
     asked = own.run(settings)
     found = build_reference(own, mesh_control(own.problem), asked)
-    fine = Setting.of(
-        **{"cells": 12, "element": "P2", "dtype": "float64", "solver": "sdirk3", "dt": "1/160", "tolerance": "1e-8"}
-    )
-    (truth,) = own.run([fine])
+    exact = {"dtype": "float64", "solver": "sdirk3", "dt": "1/80", "tolerance": "1e-8"}
+    (truth,) = own.run([Setting.of(cells=10, element="P2", **exact)])
     assert not truth.failure
     best = min(found.errors(point.first)["l2"] for point in asked)
     for name in ("l2", "max", "tip"):

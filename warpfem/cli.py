@@ -38,6 +38,7 @@ EXTRAS = {
     "tqdm": "progress",
     "scipy": "bench",
     "scikit-fem": "bench",
+    "distributed": "cluster",
 }
 """Optional packages and the extra that brings them."""
 

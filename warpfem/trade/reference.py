@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -261,9 +261,13 @@ class _Builder:
             parts[LARGEST]["algebra"] = Part(None, rough.largest / scales[LARGEST])
         quantities = {}
         for name in self._shared_quantities():
-            value, scale, parts[name] = self._quantity(name, bare, rough, limits)
+            value, scale, own_parts = self._quantity(name, bare, rough, limits)
             quantities[name] = value
             scales[name] = scale
+            # a number can stand still by accident: it is claimed to be no more accurate than the motion that it is of
+            parts[name] = {
+                kind: replace(part, band=max(part.band, parts[L2][kind].band)) for kind, part in own_parts.items()
+            }
         outcome = Outcome(times=bare.times, motion=total, quantities=quantities)
         ladders = {"space": self.space, "time": self.time}
         return Reference(outcome, scales, parts, ladders, limits, list(self.remarks))
