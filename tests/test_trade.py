@@ -50,6 +50,7 @@ def bar(tmp_path) -> Path:
 def in_process(monkeypatch):
     """Settings run in this process, which is quicker."""
     monkeypatch.setattr("warpfem.trade.study.run_order", measure)
+    monkeypatch.setattr("warpfem.trade.measure.LONG", 0.0)
 
 
 class Here(Executor):
@@ -259,7 +260,7 @@ def test_a_study_goes_on_from_what_it_has(bar, tmp_path, monkeypatch):
     settings = [Setting.of(cells=cells) for cells in (1, 2, 3, 4)]
     interrupted = Here([None, None, KeyboardInterrupt()])
     first = study(bar, tmp_path / "a", interrupted)
-    monkeypatch.setattr(first, "_run_each", lambda s, seconds: one_by_one(interrupted, first, s))
+    monkeypatch.setattr(first, "_run_each", lambda s, rounds: one_by_one(interrupted, first, s))
     with pytest.raises(KeyboardInterrupt):
         first.run(settings, 2)
     with open(tmp_path / "a" / "runs.jsonl", "ab") as file:
@@ -440,7 +441,8 @@ def test_a_cluster_loses_a_worker_and_no_result(bar, tmp_path):
     assert len({point.first.steps for point in points}) == len(settings)
 
 
-def test_no_scheduler_is_a_clear_error():
+def test_no_scheduler_is_a_clear_error(monkeypatch):
     pytest.importorskip("distributed")
+    monkeypatch.setattr("warpfem.trade.executors.PATIENCE", "1s")
     with pytest.raises(OutputError, match="no Dask scheduler"), cluster_executor("tcp://127.0.0.1:1"):
         pass

@@ -79,14 +79,12 @@ def extrapolate(levels: Sequence[np.ndarray], sizes: Sequence[float]) -> Extrapo
     value = c + weight * (c - b)
     drift = value - before  # what the limit has changed by, which shrinks faster than the error
     shrink = (h[1] / h[2]) ** -order
-    # where the field is least smooth, it converges more slowly than as a whole
-    slowest = min(order, observed_order(_most(b - a) / largest, h) or LEAST_ORDER)
-    largest_weight = 1.0 / ((h[1] / h[2]) ** slowest - 1.0)
+    # the largest error is where the field is least smooth: of single vectors the limit claims nothing
     return Extrapolated(
         value,
         order,
         max(CLAIM * weight * last, shrink * _rms(drift)),
-        max(CLAIM * largest_weight * largest, shrink * _most(drift)),
+        max(weight * largest, shrink * _most(drift)),
     )
 
 
