@@ -19,11 +19,12 @@ from warpfem.trade.axes import kind_of, mesh_control, parse_axes, settings_of
 from warpfem.trade.executors import cluster_executor, local_executor
 from warpfem.trade.extrapolation import MOST_ORDER, extrapolate, observed_order
 from warpfem.trade.front import answer, candidates, front
+from warpfem.trade.ladders import Part
 from warpfem.trade.measure import measure
 from warpfem.trade.outcome import Order, Outcome
 from warpfem.trade.problem import Problem, Setting
 from warpfem.trade.process import run_order
-from warpfem.trade.reference import Part, Reference, build_reference
+from warpfem.trade.reference import Reference, build_reference
 from warpfem.trade.store import Store
 from warpfem.trade.study import Point, Study, difference
 

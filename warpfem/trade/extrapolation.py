@@ -20,6 +20,9 @@ CLAIM = 0.5
 """The part of the correction that remains in the error band. At re-entrant corners and clamps, where errors of coarse
 meshes fall faster than they go on to, a third of it has been seen to remain."""
 
+SAFETY = 1.25
+"""Factor of estimates from the levels' own scatter (Roache 1994)."""
+
 ALIGNED = 0.5
 """Cosine between two differences of fields from which on both go the same way."""
 
@@ -83,8 +86,8 @@ def extrapolate(levels: Sequence[np.ndarray], sizes: Sequence[float]) -> Extrapo
     return Extrapolated(
         value,
         order,
-        max(CLAIM * weight * last, shrink * _rms(drift)),
-        max(weight * largest, shrink * _most(drift)),
+        max(CLAIM * weight * last, SAFETY * shrink * _rms(drift)),
+        max(weight * largest, SAFETY * shrink * _most(drift)),
     )
 
 
@@ -113,9 +116,15 @@ def observed_order(ratio: float, sizes: Sequence[float]) -> float | None:
     return 0.5 * (low + high)
 
 
+def norms(field: np.ndarray) -> tuple[float, float]:
+    """The root mean square and the largest length of vectors in the last axis."""
+    squares = (field**2).sum(axis=-1)
+    return float(np.sqrt(squares.mean())), float(np.sqrt(squares.max()))
+
+
 def _rms(field: np.ndarray) -> float:
-    return float(np.sqrt((field**2).sum(axis=-1).mean()))
+    return norms(field)[0]
 
 
 def _most(field: np.ndarray) -> float:
-    return float(np.sqrt((field**2).sum(axis=-1).max()))
+    return norms(field)[1]

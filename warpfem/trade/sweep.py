@@ -86,7 +86,7 @@ def sweep(
     reference, refusal = None, ""
     ordered: list[Candidate] = []
     try:
-        reference = build_reference(study, mesh, points, name)
+        reference = build_reference(study, mesh, points, name, min(targets))
     except SimulationError as error:
         refusal = str(error)
     points = study.run(settings, repeats)
