@@ -69,14 +69,14 @@ class Here(Executor):
         if error is not None:
             future.set_exception(error)
         else:
-            self.labels.append(order.request[1].label)
+            self.labels.append(order.setting.label)
             future.set_result(function(order))
         return future
 
 
 def fake(order: Order) -> Outcome:
     """An outcome whose error is 1 / cells^2, at a cost of cells^3."""
-    cells = int(order.request[1].get("cells", "2"))
+    cells = int(order.setting.get("cells", "2"))
     motion = np.full((3, 4, 2), 1.0 + cells**-2.0)
     times = np.arange(3.0)
     return Outcome(load=order.load, seconds=[0.01 * cells**3], mesh_size=1.0 / cells, times=times, motion=motion)
@@ -285,7 +285,7 @@ def test_a_study_goes_on_from_what_it_has(bar, tmp_path, monkeypatch):
 def one_by_one(executor, own, settings):
     """Outcomes come while later settings are not submitted yet, as with one worker."""
     for setting in settings:
-        order = Order((own.problem, setting), own.places, 1, 1.0, own.load)
+        order = Order(own.problem, setting, own.places, 1, 1.0, own.load)
         yield setting, executor.submit(fake, order).result()
 
 
@@ -326,7 +326,7 @@ def test_failures_are_results(bar, tmp_path):
     bar.write_text(BAR.replace("    mesh =", f"{body}    mesh ="))
     reasons = {}
     for setting in [*(Setting.of(kind=name) for name in actions), Setting.of(solver="velocity_verlet", E=1e7)]:
-        order = Order((Problem.of(bar), setting), [np.array([[1.0, 0.5]])], 1, 5.0, "serial")
+        order = Order(Problem.of(bar), setting, [np.array([[1.0, 0.5]])], 1, 5.0, "serial")
         reasons[setting.label] = run_order(order).failure
     for name, reason in {
         "kind=die": "killed by SIGKILL",

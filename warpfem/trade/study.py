@@ -162,7 +162,7 @@ class Study:
     def _run_each(self, settings: Sequence[Setting], rounds: int) -> Iterator[tuple[Setting, Outcome]]:
         """Outcomes as they come; what a lost worker had in hand is submitted again."""
         orders = {
-            setting: Order((self.problem, setting), self.places, rounds, self.limit, self.load, self.threads)
+            setting: Order(self.problem, setting, self.places, rounds, self.limit, self.load, self.threads)
             for setting in settings
         }
         futures: dict[Future[Outcome], tuple[Setting, int]] = {
