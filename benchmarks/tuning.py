@@ -104,7 +104,8 @@ def measure(case: Case, target: float, folder: Path, limit: float, repeats: int)
         except SimulationError as error:
             return record | {"refusal": str(error)}
         record |= {"tuning_seconds": time.perf_counter() - start, "tried": found.tried}
-        (true,) = study.solve([true_setting(case)], limit=10 * limit)
+        patient = Study(problem, study.store, pool, limit=10.0 * limit, say=say)
+        (true,) = patient.solve([true_setting(case)])
         if true.failure:
             return record | {"refusal": f"no true motion: {true.failure}"}
 
@@ -114,7 +115,7 @@ def measure(case: Case, target: float, folder: Path, limit: float, repeats: int)
             return relative(difference(point.first, true.first), found.reference.scales)["l2"]
 
         quick = 4.0 * max(found.point.seconds, 1.0) + 5.0  # what takes longer cannot be the best
-        points = study.run(sweep_settings(case), limit=quick)
+        points = Study(problem, study.store, pool, limit=quick, say=say).run(sweep_settings(case))
         within = sorted((p for p in points if error_of(p) <= target), key=lambda p: p.seconds)
         near = [p.setting for p in within if p.seconds <= 1.5 * within[0].seconds][:4]
         own, *others = study.run([found.setting, *near], repeats)

@@ -115,7 +115,7 @@ class Law:
 
     def __call__(self, order: Order) -> Outcome:
         self.runs += 1
-        problem, setting = order.request
+        problem, setting = order.problem, order.setting
         scene = problem.build(setting).scene
         body, solver = scene.bodies[0], scene.solver
         h = float(np.sqrt(2.0 / body.mesh.cell_count))
@@ -178,7 +178,7 @@ def sweep(study: Study, law: Law, target: float, name: str) -> float:
         for element in ("linear", "quadratic"):
             for own in explicit + implicit:
                 setting = Setting.of(cells=cells, **{"scene.element": element}, **own)
-                outcome = law(Order((study.problem, setting), study.places, 1, 1.0, "serial"))
+                outcome = law(Order(study.problem, setting, study.places, 1, 1.0, "serial"))
                 best = min(best, outcome.seconds[0]) if true_error(outcome, name) <= target else best
     return best
 

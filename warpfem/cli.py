@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warpfem
 from warpfem.checkpoint import Checkpoint, checkpoint_path
@@ -26,6 +26,11 @@ from warpfem.errors import MissingExtraError, OutputError, SimulationError, Time
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 from warpfem.solvers import StaticEquilibrium
+
+if TYPE_CHECKING:
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.study import Study
+    from warpfem.trade.sweep import Sweep
 
 OK, FAILED, WRONG_USE = 0, 1, 2
 
@@ -39,6 +44,7 @@ EXTRAS = {
     "tqdm": "progress",
     "scipy": "bench",
     "scikit-fem": "bench",
+    "distributed": "cluster",
 }
 """Optional packages and the extra that brings them."""
 
@@ -234,7 +240,7 @@ def _tune_parser(commands: Any) -> None:
         "--out", type=Path, metavar="FILE", help="file of the settings (default: output/SCENE.settings.toml)"
     )
     tune.add_argument("--json", action="store_true", help="print the result as JSON, and nothing else")
-    tune.set_defaults(command=_tune)
+    tune.set_defaults(command=_tune, scheduler=None)
 
 
 def _study_options(parser: argparse.ArgumentParser) -> None:
@@ -616,45 +622,19 @@ def _trade(arguments: argparse.Namespace) -> int:
     and several times, and compares them with a reference that is finer in space and time.
 
     Writes trade.csv, trade.json and, with the extra 'plot', trade.png and trade.svg. A study that was interrupted or
-    killed goes on from the runs that it has when the same command is given again.
+    killed goes on from the runs that it has when the command is given again. Exits with 1 if there is no reference,
+    or none that is good enough for an error that was asked for.
     """
     from warpfem.trade import report
-    from warpfem.trade.axes import default_axes, mesh_control, parse_axes, settings_of
-    from warpfem.trade.executors import cluster_executor, local_executor
     from warpfem.trade.plot import plot
-    from warpfem.trade.problem import Problem
-    from warpfem.trade.store import Store
-    from warpfem.trade.study import Study
-    from warpfem.trade.sweep import TARGETS, require_quantity, sweep
 
-    _start_warp()
-    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
-    mesh = mesh_control(problem)
-    axes = parse_axes(arguments.axes, problem) or default_axes(problem, mesh)
-    out = arguments.out or Path("output") / f"{arguments.scene.stem}.trade"
-    alone = arguments.workers == 1 and arguments.scheduler is None
     say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
-    executor = cluster_executor(arguments.scheduler) if arguments.scheduler else local_executor(arguments.workers)
-    with executor as pool:
-        study = Study(
-            problem,
-            Store(out),
-            pool,
-            load="serial" if alone else "parallel",
-            limit=float(arguments.limit),
-            threads=None if alone else 1,
-            say=say,
-        )
-        require_quantity(study, arguments.quantity)
-        say(f"{arguments.scene}: {len(settings_of(axes, problem))} settings of {', '.join(a.name for a in axes)}")
-        done = sweep(
-            study,
-            axes,
-            mesh,
-            name=arguments.quantity,
-            targets=arguments.errors or TARGETS,
-            repeats=arguments.repeats,
-        )
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.trade"
+    _start_warp()
+    try:
+        done = _sweep(arguments, out, say)
+    except KeyboardInterrupt:
+        return _fail(SimulationError(f"interrupted: what has been run is in {out}, and the command goes on"), FAILED)
     written = report.write(done, out)
     if done.reference is not None:
         try:
@@ -666,7 +646,48 @@ def _trade(arguments: argparse.Namespace) -> int:
     else:
         print(report.text(done))
         print(f"wrote {', '.join(map(str, written))}")
-    return FAILED if done.reference is None or any(answer.refusal for answer in done.answers) else OK
+    refused = arguments.errors is not None and any(answer.refusal for answer in done.answers)
+    return FAILED if done.reference is None or refused else OK
+
+
+def _sweep(arguments: argparse.Namespace, out: Path, say: Callable[[str], None]) -> Sweep:
+    """Runs the study; what can be wrong with the command is said before anything is run."""
+    from warpfem.trade.axes import default_axes, mesh_control, parse_axes, settings_of
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.sweep import TARGETS, require_quantity, sweep
+
+    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
+    axes = parse_axes(arguments.axes, problem)
+    mesh = mesh_control(problem)
+    axes = axes or default_axes(problem, mesh)
+    require_quantity(problem, arguments.quantity)
+    say(f"{arguments.scene}: {len(settings_of(axes, problem))} settings of {', '.join(axis.name for axis in axes)}")
+    with _study(arguments, problem, out, say) as study:
+        targets = arguments.errors or TARGETS
+        return sweep(study, axes, mesh, name=arguments.quantity, targets=targets, repeats=arguments.repeats)
+
+
+@contextmanager
+def _study(
+    arguments: argparse.Namespace, problem: Problem, folder: Path, say: Callable[[str], None]
+) -> Iterator[Study]:
+    """What runs settings of a problem, and keeps what comes of them in a folder."""
+    from warpfem.trade.executors import cluster_executor, local_executor
+    from warpfem.trade.store import Store
+    from warpfem.trade.study import Study
+
+    alone = arguments.workers == 1 and arguments.scheduler is None
+    executor = cluster_executor(arguments.scheduler) if arguments.scheduler else local_executor(arguments.workers)
+    with executor as pool:
+        yield Study(
+            problem,
+            Store(folder),
+            pool,
+            load="serial" if alone else "parallel",
+            limit=float(arguments.limit),
+            threads=None if alone else 1,
+            say=say,
+        )
 
 
 def _tune(arguments: argparse.Namespace) -> int:
@@ -674,37 +695,27 @@ def _tune(arguments: argparse.Namespace) -> int:
     it to a file that `warpfem run SCENE --settings FILE` takes.
 
     Settings are tried on the first half of the frames, and what is found is verified on the others, against a reference
-    that is finer in space and time; without one that is accurate enough the search is refused. Runs are kept in
-    output/SCENE.trade, where those of `warpfem trade` are, and not repeated.
+    that is finer in space and time; without one that is accurate enough the search is refused, with exit code 1. Runs
+    are kept in output/SCENE.trade, where those of `warpfem trade` are, and not repeated.
     """
     from warpfem.trade import tuning_report
     from warpfem.trade.axes import mesh_control
-    from warpfem.trade.executors import local_executor
     from warpfem.trade.problem import Problem
-    from warpfem.trade.store import Store
-    from warpfem.trade.study import Study
     from warpfem.trade.sweep import require_quantity
     from warpfem.trade.tune import tune
 
     _start_warp()
     problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
+    require_quantity(problem, arguments.quantity)
     mesh = mesh_control(problem)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.settings.toml"
-    _make_writable(out)
+    folder = Path("output") / f"{arguments.scene.stem}.trade"
     say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
-    alone = arguments.workers == 1
-    with local_executor(arguments.workers) as pool:
-        study = Study(
-            problem,
-            Store(Path("output") / f"{arguments.scene.stem}.trade"),
-            pool,
-            load="serial" if alone else "parallel",
-            limit=float(arguments.limit),
-            threads=None if alone else 1,
-            say=say,
-        )
-        require_quantity(study, arguments.quantity)
-        found = tune(study, mesh, arguments.quantity, arguments.error)
+    try:
+        with _study(arguments, problem, folder, say) as study:
+            found = tune(study, mesh, arguments.quantity, arguments.error)
+    except KeyboardInterrupt:
+        return _fail(SimulationError(f"interrupted: what has been run is in {folder}, and the command goes on"), FAILED)
     tuning_report.write(found, study, out, _tune_command(arguments))
     if arguments.json:
         print(json.dumps(tuning_report.data(found, study), indent=2, allow_nan=False))

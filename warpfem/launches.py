@@ -1,4 +1,4 @@
-"""Recorded launches, and passes of them that are divided among threads."""
+"""Recorded launches, which cost a fraction of others, and passes of them that are divided among threads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,65 @@ from warpfem.threads import Job
 MOST_RECORDED = 8
 """Recordings kept: with a fixed dt there are two or three. Launching one takes a tenth of launching anew."""
 
+MOST_KEPT = 256
+"""Launches that a launcher keeps: a step of an implicit scheme has some tens of different ones."""
+
 Recording = TypeVar("Recording")
+
+
+class Launcher:
+    """Launches kernels on a device and keeps what it has launched, to launch it again at a fraction of the cost.
+
+    What is kept is found by its kernel and arrays; numbers may change. A tape does not see these launches.
+    """
+
+    def __init__(self, device: wp.DeviceLike) -> None:
+        self._device = device
+        self._kept: dict[tuple, tuple[wp.Launch, list]] = {}
+
+    def __call__(self, kernel: wp.Kernel, tasks: int, inputs: Sequence, outputs: Sequence) -> None:
+        """Launches a kernel."""
+        arguments = [*inputs, *outputs]
+        key = (kernel, tasks, *[(a.ptr, a.size) for a in arguments if isinstance(a, wp.array)])
+        kept = self._kept.get(key)
+        if kept is None:
+            launch = wp.launch(kernel, tasks, inputs=inputs, outputs=outputs, device=self._device, record_cmd=True)
+            if launch is None:  # no tasks
+                return
+            if len(self._kept) == MOST_KEPT:
+                self._kept.clear()
+            self._kept[key] = launch, arguments
+        else:
+            launch, own = kept
+            for index, value in enumerate(arguments):
+                if value is not own[index] and not isinstance(value, wp.array):
+                    launch.set_param_at_index(index, value)
+                    own[index] = value
+        launch.launch()
+
+
+class Total:
+    """A float64 number on a device that kernels add to.
+
+    Attributes:
+        array: the number, for kernels.
+    """
+
+    def __init__(self, device: wp.DeviceLike) -> None:
+        self.array = wp.zeros(1, dtype=wp.float64, device=device)
+        self._view = self.array.numpy() if wp.get_device(device).is_cpu else None  # making the view costs a launch
+
+    def clear(self) -> None:
+        """Sets it to 0."""
+        if self._view is None:
+            self.array.zero_()
+        else:
+            self._view[0] = 0.0
+
+    def read(self) -> float:
+        """Its value."""
+        view = self.array.numpy() if self._view is None else self._view
+        return float(view[0])
 
 
 class Recordings:

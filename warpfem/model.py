@@ -16,12 +16,14 @@ from warpfem.boundary import PointForce, Traction
 from warpfem.dtypes import FloatName, types, uniform_array
 from warpfem.elements import ElementKernels, element_kernels
 from warpfem.errors import SceneError, SimulationError
+from warpfem.launches import Launcher, Total
 from warpfem.materials import Constitutive, HookeanMaterial
 from warpfem.mesh import Mesh
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
 from warpfem.stiffness import all_blocks, pair_count
+from warpfem.strips import STRIP
 from warpfem.threads import CELLS_PER_THREAD, Team, available_threads
 
 if TYPE_CHECKING:
@@ -174,6 +176,7 @@ class CellBlock:
         self.kernels = self.bounding_kernels = kernels
         self.shape = kernels.shape
         self.device = device
+        self._launch = Launcher(device)
         self.vectorized: VectorizedForce | None = None
         self.count = sum(mesh.cell_count for mesh in meshes)
         self.index = np.concatenate([start + np.arange(b.mesh.cell_count) for b, _, start in parts])
@@ -253,7 +256,12 @@ class CellBlock:
         own = [arrays[argument.label] for argument in kernel.adj.args if argument.label in arrays]
         by_cell = name == "frequency" or name.endswith("stiffness")
         tasks = len(arrays["cells"]) if by_cell else len(arrays["volume"])
-        return wp.launch(kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device, record_cmd=record)
+        if record or name.startswith("taped"):
+            return wp.launch(
+                kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device, record_cmd=record
+            )
+        self._launch(kernel, tasks, [*own, *inputs], outputs)
+        return None
 
     def _arguments_of(self, part: slice) -> dict[str, wp.array]:
         places = self.shape.quadrature_count
@@ -323,7 +331,8 @@ class Model:
         self.dead_load = None if load is None else self._device_array(load, self.types.vector)
         self.supports = self._supports()
         self.contact = self._contact()
-        self._sum = wp.zeros(1, dtype=wp.float64, device=self.device)
+        self._sum = Total(self.device)
+        self._launch = Launcher(self.device)
 
     # --- finalising -------------------------------------------------------------------------------------
 
@@ -447,17 +456,17 @@ class Model:
 
     def dot(self, a: wp.array, b: wp.array) -> float:
         """a . b over all points, summed in float64."""
-        self._sum.zero_()
+        self._sum.clear()
         kernel = point_kernels(self.dim, self.dtype).dot
-        wp.launch(kernel, chunks(a.shape[0]), inputs=[a, b], outputs=[self._sum], device=self.device)
-        return float(self._sum.numpy()[0])
+        self._launch(kernel, chunks(a.shape[0]), [a, b], [self._sum.array])
+        return self._sum.read()
 
     def elastic_energy(self, u: wp.array) -> float:
         """U(u) [J], summed in float64."""
-        self._sum.zero_()
+        self._sum.clear()
         for block in self.blocks:
-            block.launch("energy", [u], [self._sum])
-        return float(self._sum.numpy()[0])
+            block.launch("energy", [u], [self._sum.array])
+        return self._sum.read()
 
     def energy_densities(self, state: State) -> np.ndarray:
         """The energy density psi of every cell, its mean if quadratic, (cell_count,) float64 [J/m^3], 0 at rest.
@@ -477,22 +486,22 @@ class Model:
         """Penalty energy of the obstacles [J]."""
         if self.contact is None:
             return 0.0
-        self._sum.zero_()
-        self.contact.add_energy(u, self._sum)
-        return float(self._sum.numpy()[0])
+        self._sum.clear()
+        self.contact.add_energy(u, self._sum.array)
+        return self._sum.read()
 
     def energies(self, state: State) -> Energies:
         """All energies of a state [J]."""
-        self._sum.zero_()
+        self._sum.clear()
         kernel = point_kernels(self.dim, self.dtype).kinetic_energy
         wp.launch(
             kernel,
             chunks(self.point_count),
             inputs=[self.mass, state.v],
-            outputs=[self._sum],
+            outputs=[self._sum.array],
             device=self.device,
         )
-        kinetic = float(self._sum.numpy()[0])
+        kinetic = self._sum.read()
         load = 0.0 if self.dead_load is None else 0.0 - self.dot(self.dead_load, state.u)
         return Energies(kinetic, self.elastic_energy(state.u), load, self.contact_energy(state.u))
 
@@ -522,6 +531,16 @@ class Model:
         """
         for block in self.blocks:
             block.vectorize(self.rest_points, least, self.team)
+
+    def describe_forces(self) -> str:
+        """How :meth:`add_internal_force` computes them, and on how many threads."""
+        count = sum(block.count for block in self.blocks if block.vectorized)
+        if not count:
+            return "one cell at a time, on one thread"
+        plain = self.cell_count - count
+        others = f", {plain} others one at a time" if plain else ""
+        threads = "1 thread" if self.team.size == 1 else f"{self.team.size} threads"
+        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
+from warpfem.launches import Launcher
 from warpfem.linear.operators import TangentOperator
 from warpfem.model import Model
 from warpfem.points import CHUNK, chunks
@@ -84,10 +85,11 @@ class BlockJacobi(Preconditioner):
     def __init__(self, operator: TangentOperator) -> None:
         self._operator = operator
         self._kernel = _kernels(operator.model.dim, operator.model.dtype).multiply_blocks
+        self._launch = Launcher(operator.model.device)
 
     def apply(self, r: wp.array, z_out: wp.array) -> None:
         inputs = [self._operator.inverse_diagonal, r]
-        wp.launch(self._kernel, r.shape[0], inputs=inputs, outputs=[z_out], device=r.device)
+        self._launch(self._kernel, r.shape[0], inputs, [z_out])
 
 
 class ConjugateGradients:
@@ -108,6 +110,7 @@ class ConjugateGradients:
         self._scalars = wp.zeros(5, dtype=wp.float64, device=model.device)
         self._view = self._scalars.numpy() if model.device.is_cpu else None
         self._graph: tuple | None = None
+        self._launcher = Launcher(model.device)
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
@@ -251,7 +254,7 @@ class ConjugateGradients:
         self._launch_tasks(name, 1, inputs, outputs)
 
     def _launch_tasks(self, name: str, tasks: int, inputs: list, outputs: list) -> None:
-        wp.launch(getattr(self._kernels, name), tasks, inputs=inputs, outputs=outputs, device=self.model.device)
+        self._launcher(getattr(self._kernels, name), tasks, inputs, outputs)
 
 
 @functools.cache

@@ -15,7 +15,7 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.elements import Filter
 from warpfem.errors import SimulationError
-from warpfem.launches import Recordings, jobs
+from warpfem.launches import Launcher, Recordings, jobs
 from warpfem.linear.assembly import Assembly
 from warpfem.model import CellBlock, Model, Route
 from warpfem.tensor import is_positive_definite
@@ -170,6 +170,7 @@ class TangentOperator(ABC):
         self.model = model
         self.kernels = operator_kernels(model.dim, model.dtype)
         self.hessian: Hessian = "exact"
+        self._launcher = Launcher(model.device)
         self.supports = model.supports if external else None
         self.contact = model.contact if external else None
         self.averaged = [block for block in model.blocks if block.averaged]
@@ -224,7 +225,7 @@ class TangentOperator(ABC):
         return wp.zeros(count, dtype=self.model.types.matrix, device=self.model.device)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, self.model.point_count, inputs=inputs, outputs=outputs, device=self.model.device)
+        self._launcher(kernel, self.model.point_count, inputs, outputs)
 
     def _linearize_couplings(self, u: wp.array, friction: tuple[wp.array, float] | None) -> None:
         """Those of averaged cells, and contact."""
@@ -291,7 +292,7 @@ class AssembledOperator(TangentOperator):
         """Launches a kernel over the rows of the matrix, divided among threads."""
         own = self.assembly
         matrix = [own.row_starts, own.columns, own.blocks]
-        if not self.divided:  # a graph may be listening, which does not hear of recorded launches
+        if not self.divided:
             self._launch(kernel, [0, *matrix, *vectors], [out])
             return
 

@@ -17,7 +17,6 @@ from warpfem.model import Model, State
 from warpfem.points import CHUNK
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, worst_cell
 from warpfem.solvers.stability import Watch, largest_frequency
-from warpfem.strips import STRIP
 from warpfem.subnormals import SubnormalsFlushed
 from warpfem.threads import Job, share
 from warpfem.vectorized import WINDOW
@@ -89,10 +88,6 @@ class _Passes:
         self._points = share(model.point_count, self._team.size, WINDOW)
         self._recordings = Recordings()
 
-    @property
-    def thread_count(self) -> int:
-        return self._team.size
-
     def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
         """Takes the step.
 
@@ -138,7 +133,6 @@ class _ExplicitStepper(Stepper):
         self._passes: _Passes | None = None
         if all(block.vectorized for block in model.blocks):
             self._passes = _Passes(model, self._force)
-        self.forces = self._describe_forces()
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
         self._inverse_mass = self._free_inverse_mass()
         self._recordings = Recordings()
@@ -160,16 +154,6 @@ class _ExplicitStepper(Stepper):
         held = model.supports.held.numpy().reshape(model.supports.count, -1).all(axis=1)
         inverse[model.supports.points.numpy()[held]] = 0.0
         return wp.array(inverse, dtype=model.types.scalar, device=model.device)
-
-    def _describe_forces(self) -> str:
-        count = sum(block.count for block in self.model.blocks if block.vectorized)
-        if not count:
-            return "one cell at a time, on one thread"
-        plain = self.model.cell_count - count
-        size = 1 if self._passes is None else self._passes.thread_count
-        others = f", {plain} others one at a time" if plain else ""
-        threads = "1 thread" if size == 1 else f"{size} threads"
-        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
 
     def arrays(self) -> list[wp.array]:
         own = [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]

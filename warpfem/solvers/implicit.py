@@ -118,7 +118,9 @@ class ImplicitStepper(Stepper):
 
     @property
     def linear_solver(self) -> str:
-        return str(self.newton.linear)
+        threads = self.model.team.size
+        divided = f"; the matrix on {threads} threads" if self.newton.potential.operator.divided else ""
+        return f"{self.newton.linear}{divided}"
 
     def arrays(self) -> list[wp.array]:
         own = [array for pair in self._rates for array in pair]

@@ -22,6 +22,9 @@ RESOLVED = 0.25
 TAIL = 30.0
 """Errors over the smallest one of a front that belong to the part that is extrapolated."""
 
+LEAST_TAIL = 3
+"""Settings of a front, if it has so many, that belong to that part whatever their errors."""
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -161,7 +164,8 @@ def advice(reference: Reference, name: str) -> str:
 def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
     """The time at which the front, continued as a power law from its last part, comes to an error [s]."""
     tail = [own for own in edge if own.error <= TAIL * edge[-1].error]
-    if len(tail) < 3:
+    tail = tail if len(tail) >= LEAST_TAIL else list(edge[-LEAST_TAIL:])
+    if len(tail) < 2:
         return None
     logs = np.log([[own.error, own.seconds] for own in tail])
     slope, _ = np.polyfit(logs[:, 0], logs[:, 1], 1)
