@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 from warpfem.trade.outcome import Outcome
 from warpfem.trade.problem import FORCED, Setting
-from warpfem.trade.reference import Reference
-from warpfem.trade.study import Point, Study
+from warpfem.trade.reference import relative
+from warpfem.trade.study import Point, Study, difference
 
 AIM = 0.92
 """The part of an error's goal that a search aims at."""
@@ -70,12 +70,14 @@ class Trials:
     Args:
         study: runs settings.
         reference: what they are compared with.
+        scales: what errors are relative to, by name.
         name: of the norm or quantity.
     """
 
-    def __init__(self, study: Study, reference: Reference, name: str) -> None:
+    def __init__(self, study: Study, reference: Outcome, scales: dict[str, float], name: str) -> None:
         self.study = study
         self.reference = reference
+        self.scales = scales
         self.name = name
         self.tried: set[Setting] = set()
 
@@ -92,13 +94,15 @@ class Trials:
         (trial,) = self.run([setting])
         return trial
 
-    def against(self, reference: Reference) -> Trials:
+    def against(self, reference: Outcome) -> Trials:
         """The same settings, compared with another reference."""
-        return Trials(self.study, reference, self.name)
+        return Trials(self.study, reference, self.scales, self.name)
 
     def _trial(self, point: Point) -> Trial:
-        error = math.inf if point.failure else self.reference.errors(point.first).get(self.name, math.inf)
-        return Trial(point.setting, point, error)
+        if point.failure:
+            return Trial(point.setting, point, math.inf)
+        errors = relative(difference(point.first, self.reference), self.scales)
+        return Trial(point.setting, point, errors.get(self.name, math.inf))
 
 
 def _asks_for_digits(point: Point) -> bool:
