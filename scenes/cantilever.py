@@ -22,7 +22,19 @@ def scene(
     mesh = wf.Mesh.box(size=(4, 1, 1), cells=(4 * cells, cells, cells))
     material = wf.StableNeoHookean(E=E, nu=nu)
     beam = wf.Body("beam", mesh, material, density=1000, supports=[wf.Pin("left")], element=element)
-    return wf.Scene([beam], wf.BackwardEuler(), dt=dt, gravity=(0, -9.81, 0), damping=damping, frames=frames)
+    return wf.Scene(
+        [beam],
+        wf.BackwardEuler(),
+        dt=dt,
+        gravity=(0, -9.81, 0),
+        damping=damping,
+        frames=frames,
+        quantities={
+            "tip sag": wf.quantities.final_displacement("beam", at=(4, 0.5, 0.5), axis=1),
+            "largest sag": wf.quantities.largest_displacement("beam", at=(4, 0.5, 0.5), axis=1),
+            "stress on top": wf.quantities.final_von_mises("beam", at=(1, 1, 0.5)),
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -51,7 +51,14 @@ def scene(
         supports=[wf.Pin("bottom", axes=(1,)), wf.Pin("left", axes=(0,)), wf.Pin("back", axes=(2,))],
         loads=[wf.Traction("top", (0, pull, 0))],
     )
-    return wf.Scene([block], wf.BackwardEuler(), dt=dt, damping=damping, frames=frames)
+    return wf.Scene(
+        [block],
+        wf.BackwardEuler(),
+        dt=dt,
+        damping=damping,
+        frames=frames,
+        quantities={"lengthening": wf.quantities.final_displacement("rubber", at=(1, 1, 1), axis=1)},
+    )
 
 
 if __name__ == "__main__":

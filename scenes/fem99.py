@@ -31,6 +31,7 @@ def scene(
         damping=damping,
         fps=fps,
         frames=frames,
+        quantities={"deepest": wf.quantities.largest_displacement("block", at=(0.575, 0.575), axis=1)},
     )
 
 

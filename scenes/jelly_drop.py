@@ -29,6 +29,10 @@ def scene(
         obstacles=[wf.Plane(point=(0, 0, 0), normal=(0, 1, 0), friction=friction)],
         damping=damping,
         frames=frames,
+        quantities={
+            "deepest": wf.quantities.largest_displacement("jelly", at=(0, height + 1, 0), axis=1),
+            "at the end": wf.quantities.final_displacement("jelly", at=(0, height + 1, 0), axis=1),
+        },
     )
 
 

@@ -26,7 +26,14 @@ def scene(
 
     mesh = wf.Mesh.box(size=(4, 0.5, 0.5), cells=(8 * cells, cells, cells), origin=(-2, 0, -0.25))
     bar = wf.Body("bar", mesh, wf.StVenantKirchhoff(E=E, nu=nu), density=1000, displacement=stretched)
-    return wf.Scene([bar], wf.VelocityVerlet(), dt=dt, fps=fps, frames=frames)
+    return wf.Scene(
+        [bar],
+        wf.VelocityVerlet(),
+        dt=dt,
+        fps=fps,
+        frames=frames,
+        quantities={"period": wf.quantities.period("bar", at=(2, 0.25, 0), axis=0)},
+    )
 
 
 if __name__ == "__main__":

@@ -34,7 +34,17 @@ def scene(
         density=1000,
         supports=[wf.Pin("bottom"), wf.PrescribedMotion("top", turn)],
     )
-    return wf.Scene([column], wf.BackwardEuler(), dt=dt, damping=damping, frames=frames)
+    return wf.Scene(
+        [column],
+        wf.BackwardEuler(),
+        dt=dt,
+        damping=damping,
+        frames=frames,
+        quantities={
+            "turn at mid-height": wf.quantities.final_displacement("column", at=(0.5, 2, 0), axis=2),
+            "stress at mid-height": wf.quantities.final_von_mises("column", at=(0.5, 2, 0)),
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -30,6 +30,10 @@ def scene(
         gravity=(0, -9.81, 0),
         damping=damping,
         frames=frames,
+        quantities={
+            "growth of the stiff bar": wf.quantities.final_displacement("stiff", at=(0.25, 0, 0.25), axis=1),
+            "growth of the soft bar": wf.quantities.final_displacement("soft", at=(1.25, 0, 0.25), axis=1),
+        },
     )
 
 

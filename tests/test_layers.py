@@ -22,10 +22,10 @@ LAYERS = [
         "strips",
         "subnormals",
     },
-    {"mesh", "points", "launches"},
+    {"mesh", "points", "launches", "quantities"},
     {"materials"},
     {"stiffness"},
-    {"elements", "meshing", "folds", "patches", "patch_kernels"},
+    {"elements", "meshing", "folds", "patches", "patch_kernels", "places"},
     {"scene"},
     {"supports", "contact"},
     {"model"},
@@ -33,10 +33,10 @@ LAYERS = [
     {"linear", "reactions"},
     {"solvers"},
     {"simulation"},
-    {"usd", "checkpoint", "failure"},
+    {"usd", "checkpoint", "failure", "motion"},
     {"record", "explain", "scene_file", "preview"},
     {"static_run"},
-    {"extremes"},
+    {"extremes", "trade"},
     {"cli"},
     {"__main__"},
 ]
@@ -89,4 +89,15 @@ def test_optional_packages_are_imported_where_they_are_used(path):
     top = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
     names = {alias.name.split(".")[0] for node in top if isinstance(node, ast.Import) for alias in node.names}
     names |= {(node.module or "").split(".")[0] for node in top if isinstance(node, ast.ImportFrom)}
-    assert not names & {"meshio", "pytetwild", "matplotlib", "PIL", "tqdm", "trimesh", "scipy", "pyamg", "pypardiso"}
+    assert not names & {
+        "meshio",
+        "pytetwild",
+        "matplotlib",
+        "PIL",
+        "tqdm",
+        "trimesh",
+        "scipy",
+        "pyamg",
+        "pypardiso",
+        "distributed",
+    }

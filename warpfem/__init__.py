@@ -10,6 +10,7 @@ wf.run(scene, "jelly.usdc")
 
 __version__ = "0.1.0"
 
+from warpfem import quantities
 from warpfem.boundary import BoxWalls, Pin, Plane, PointForce, PrescribedMotion, Sphere, Traction
 from warpfem.errors import (
     MaterialError,
@@ -93,6 +94,7 @@ __all__ = [
     "VelocityVerlet",
     "WarpfemError",
     "elastic_moduli",
+    "quantities",
     "reactions",
     "read_mesh",
     "read_surface",

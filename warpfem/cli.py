@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shlex
 import signal
 import sys
 import time
@@ -16,14 +17,20 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import warpfem
 from warpfem.checkpoint import Checkpoint, checkpoint_path
 from warpfem.dtypes import FloatName
-from warpfem.errors import OutputError, SimulationError, TimeStepError, WarpfemError
+from warpfem.errors import MissingExtraError, OutputError, SimulationError, TimeStepError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 from warpfem.solvers import StaticEquilibrium
+
+if TYPE_CHECKING:
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.study import Study
+    from warpfem.trade.sweep import Sweep
 
 OK, FAILED, WRONG_USE = 0, 1, 2
 
@@ -37,6 +44,7 @@ EXTRAS = {
     "tqdm": "progress",
     "scipy": "bench",
     "scikit-fem": "bench",
+    "distributed": "cluster",
 }
 """Optional packages and the extra that brings them."""
 
@@ -138,6 +146,9 @@ def _parser() -> argparse.ArgumentParser:
     _time_options(explain)
     explain.set_defaults(command=_explain)
 
+    _trade_parser(commands)
+    _tune_parser(commands)
+
     preview = commands.add_parser("preview", help="draw a run to PNG or GIF", description=_preview.__doc__)
     preview.add_argument("file", type=Path, metavar="FILE", help="a USD file that warpfem wrote")
     preview.add_argument(
@@ -166,6 +177,103 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _trade_parser(commands: Any) -> None:
+    trade = commands.add_parser(
+        "trade", help="measure what accuracy costs in a scene, setting by setting", description=_trade.__doc__
+    )
+    _study_options(trade)
+    trade.add_argument(
+        "--axis",
+        action="append",
+        default=[],
+        dest="axes",
+        metavar="NAME=VALUE,...",
+        help="what to vary, may be repeated: a parameter of the scene, or dt, solver, element, material, dtype, refine "
+        "(how often all cells are divided), or a setting of the solver such as tolerance; without any, the mesh, the "
+        "element, the scheme and dt",
+    )
+    trade.add_argument(
+        "--error",
+        type=_error,
+        action="append",
+        dest="errors",
+        metavar="E",
+        help="relative error to find the cheapest setting for, as 1%% or 0.01; may be repeated (default: 10%%, 1%% and "
+        "0.1%%)",
+    )
+    trade.add_argument(
+        "--repeats", type=_positive, default=3, metavar="N", help="processes that time each setting (default: 3)"
+    )
+    where = trade.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers",
+        type=_positive,
+        default=1,
+        metavar="N",
+        help="settings that run at the same time on this machine: their times are marked, and not mixed with others",
+    )
+    where.add_argument("--scheduler", metavar="ADDRESS", help="scheduler of a Dask cluster to run the settings on")
+    trade.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder of the results, and of the runs that a study goes on from (default: output/SCENE.trade)",
+    )
+    trade.add_argument("--json", action="store_true", help="print the results as JSON, and nothing else")
+    trade.set_defaults(command=_trade)
+
+
+def _tune_parser(commands: Any) -> None:
+    tune = commands.add_parser(
+        "tune", help="find the cheapest setting of a scene within an error", description=_tune.__doc__
+    )
+    _study_options(tune)
+    tune.add_argument("--error", type=_error, required=True, metavar="E", help="relative error, as 1%% or 0.01")
+    tune.add_argument(
+        "--workers",
+        type=_positive,
+        default=1,
+        metavar="N",
+        help="settings that are tried at the same time on this machine; what is found is timed alone",
+    )
+    tune.add_argument(
+        "--out", type=Path, metavar="FILE", help="file of the settings (default: output/SCENE.settings.toml)"
+    )
+    tune.add_argument("--json", action="store_true", help="print the result as JSON, and nothing else")
+    tune.set_defaults(command=_tune, scheduler=None)
+
+
+def _study_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
+    _set_option(parser)
+    parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
+    parser.add_argument("--frames", type=_positive, metavar="N", help="frames to simulate after the initial one")
+    parser.add_argument(
+        "--quantity",
+        default="l2",
+        metavar="Q",
+        help="what the error is of: a quantity that the scene declares, or l2 or max, the norms of the motion "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--limit",
+        type=_positive,
+        default=300,
+        metavar="SECONDS",
+        help="wall time after which a setting has failed, also one of the reference (default: %(default)s)",
+    )
+
+
+def _error(text: str) -> float:
+    number = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    if not 0.0 < number < 1.0:
+        raise argparse.ArgumentTypeError(f"must be between 0 and 100 %, not {text}")
+    return number
+
+
+_error.__name__ = "error"  # argparse's name for what is no number
+
+
 def _positive(text: str) -> int:
     number = int(text)
     if number < 1:
@@ -179,12 +287,20 @@ _positive.__name__ = "number"  # argparse's name for what is no number
 def _scene_options(parser: argparse.ArgumentParser, dtype: FloatName = "float32") -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
     parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
-    parser.add_argument("--dtype", choices=("float32", "float64"), default=dtype, help=f"default: {dtype}")
+    parser.add_argument("--dtype", choices=("float32", "float64"), help=f"default: {dtype}")
+    parser.set_defaults(default_dtype=dtype)
+    _set_option(parser)
+    parser.add_argument(
+        "--settings", type=Path, metavar="F", help="file that warpfem tune wrote; --set and other options win over it"
+    )
+
+
+def _set_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set",
         action="append",
         default=[],
-        dest="settings",
+        dest="parameters",
         metavar="NAME=VALUE",
         help="set a parameter of the scene; may be repeated",
     )
@@ -198,15 +314,29 @@ def _time_options(parser: argparse.ArgumentParser) -> None:
 def _load(arguments: argparse.Namespace) -> Scene:
     from warpfem.scene_file import load_scene
 
-    settings = {}
-    for text in arguments.settings:
+    given_parameters = _parameters(arguments)
+    dtype = arguments.default_dtype
+    if arguments.settings is None:
+        scene = load_scene(arguments.scene, given_parameters)
+    else:
+        from warpfem.trade.settings_file import SettingsFile
+
+        choice = SettingsFile.read(arguments.settings).choose(arguments.settings, arguments.scene, given_parameters)
+        scene, dtype = choice.scene, choice.dtype
+    arguments.dtype = arguments.dtype or dtype
+    given = {"frames": arguments.frames, "fps": arguments.fps}
+    return replace(scene, **{name: value for name, value in given.items() if value is not None})
+
+
+def _parameters(arguments: argparse.Namespace) -> dict[str, str]:
+    """What --set gives."""
+    parameters = {}
+    for text in arguments.parameters:
         name, equals, value = text.partition("=")
         if not equals or not name.isidentifier():
             raise WarpfemError(f"--set takes NAME=VALUE, for example --set cells=16, not '{text}'")
-        settings[name] = value
-    scene = load_scene(arguments.scene, settings)
-    given = {"frames": arguments.frames, "fps": arguments.fps}
-    return replace(scene, **{name: value for name, value in given.items() if value is not None})
+        parameters[name] = value
+    return parameters
 
 
 def _start_warp() -> None:
@@ -315,9 +445,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _recipe(arguments: argparse.Namespace) -> str:
-    """What makes the scene: the file and the parameters."""
-    contents = hashlib.sha256(arguments.scene.read_bytes()).hexdigest()
-    return " ".join([contents, *arguments.settings])
+    """What makes the scene: its file, that of the settings and the parameters."""
+    files = [arguments.scene, *([] if arguments.settings is None else [arguments.settings])]
+    contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    return " ".join([*contents, *arguments.parameters])
 
 
 def _require_consent(out: Path) -> None:
@@ -438,6 +569,7 @@ def _static(arguments: argparse.Namespace) -> int:
 
     _start_warp()
     solver = StaticEquilibrium(arguments.tolerance, load_steps=arguments.load_steps)
+    arguments.dtype = arguments.dtype or arguments.default_dtype  # that of settings is meant for time steps
     scene = _load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.static.usdc"
     with _held_interrupt() as check_interrupt:
@@ -483,6 +615,122 @@ def _explain(arguments: argparse.Namespace) -> int:
     _start_warp()
     print(explain(_load(arguments), device=arguments.device, dtype=arguments.dtype))
     return OK
+
+
+def _trade(arguments: argparse.Namespace) -> int:
+    """Measures what accuracy costs in a scene: runs all combinations of the axes' values, each in a process of its own
+    and several times, and compares them with a reference that is finer in space and time.
+
+    Writes trade.csv, trade.json and, with the extra 'plot', trade.png and trade.svg. A study that was interrupted or
+    killed goes on from the runs that it has when the command is given again. Exits with 1 if there is no reference,
+    or none that is good enough for an error that was asked for.
+    """
+    from warpfem.trade import report
+    from warpfem.trade.plot import plot
+
+    say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.trade"
+    _start_warp()
+    try:
+        done = _sweep(arguments, out, say)
+    except KeyboardInterrupt:
+        return _fail(SimulationError(f"interrupted: what has been run is in {out}, and the command goes on"), FAILED)
+    written = report.write(done, out)
+    if done.reference is not None:
+        try:
+            written += plot(done, out)
+        except MissingExtraError as error:
+            say(str(error))
+    if arguments.json:
+        print(json.dumps(report.data(done), indent=2, allow_nan=False))
+    else:
+        print(report.text(done))
+        print(f"wrote {', '.join(map(str, written))}")
+    refused = arguments.errors is not None and any(answer.refusal for answer in done.answers)
+    return FAILED if done.reference is None or refused else OK
+
+
+def _sweep(arguments: argparse.Namespace, out: Path, say: Callable[[str], None]) -> Sweep:
+    """Runs the study; what can be wrong with the command is said before anything is run."""
+    from warpfem.trade.axes import default_axes, mesh_control, parse_axes, settings_of
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.sweep import TARGETS, require_quantity, sweep
+
+    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
+    axes = parse_axes(arguments.axes, problem)
+    mesh = mesh_control(problem)
+    axes = axes or default_axes(problem, mesh)
+    require_quantity(problem, arguments.quantity)
+    say(f"{arguments.scene}: {len(settings_of(axes, problem))} settings of {', '.join(axis.name for axis in axes)}")
+    with _study(arguments, problem, out, say) as study:
+        targets = arguments.errors or TARGETS
+        return sweep(study, axes, mesh, name=arguments.quantity, targets=targets, repeats=arguments.repeats)
+
+
+@contextmanager
+def _study(
+    arguments: argparse.Namespace, problem: Problem, folder: Path, say: Callable[[str], None]
+) -> Iterator[Study]:
+    """What runs settings of a problem, and keeps what comes of them in a folder."""
+    from warpfem.trade.executors import cluster_executor, local_executor
+    from warpfem.trade.store import Store
+    from warpfem.trade.study import Study
+
+    alone = arguments.workers == 1 and arguments.scheduler is None
+    executor = cluster_executor(arguments.scheduler) if arguments.scheduler else local_executor(arguments.workers)
+    with executor as pool:
+        yield Study(
+            problem,
+            Store(folder),
+            pool,
+            load="serial" if alone else "parallel",
+            limit=float(arguments.limit),
+            threads=None if alone else 1,
+            say=say,
+        )
+
+
+def _tune(arguments: argparse.Namespace) -> int:
+    """Finds the cheapest setting of a scene within an error - mesh, cells, time steps, scheme, precision -, and writes
+    it to a file that `warpfem run SCENE --settings FILE` takes.
+
+    Settings are tried on the first half of the frames, and what is found is verified on the others, against a reference
+    that is finer in space and time; without one that is accurate enough the search is refused, with exit code 1. Runs
+    are kept in output/SCENE.trade, where those of `warpfem trade` are, and not repeated.
+    """
+    from warpfem.trade import tuning_report
+    from warpfem.trade.axes import mesh_control
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.sweep import require_quantity
+    from warpfem.trade.tune import tune
+
+    _start_warp()
+    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
+    require_quantity(problem, arguments.quantity)
+    mesh = mesh_control(problem)
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.settings.toml"
+    folder = Path("output") / f"{arguments.scene.stem}.trade"
+    say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
+    try:
+        with _study(arguments, problem, folder, say) as study:
+            found = tune(study, mesh, arguments.quantity, arguments.error)
+    except KeyboardInterrupt:
+        return _fail(SimulationError(f"interrupted: what has been run is in {folder}, and the command goes on"), FAILED)
+    tuning_report.write(found, study, out, _tune_command(arguments))
+    if arguments.json:
+        print(json.dumps(tuning_report.data(found, study), indent=2, allow_nan=False))
+    else:
+        print(tuning_report.text(found))
+        print(f"wrote {out}")
+    return OK
+
+
+def _tune_command(arguments: argparse.Namespace) -> str:
+    """The command as one would write it, without what does not bear on its result."""
+    given = [f"--set {text}" for text in arguments.parameters]
+    given += [] if arguments.frames is None else [f"--frames {arguments.frames}"]
+    given += [] if arguments.quantity == "l2" else [f"--quantity {shlex.quote(arguments.quantity)}"]
+    return " ".join(["warpfem tune", str(arguments.scene), f"--error {arguments.error:g}", *given])
 
 
 def _preview(arguments: argparse.Namespace) -> int:

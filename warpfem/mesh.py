@@ -257,6 +257,17 @@ class Mesh:
         points = np.concatenate([self.points, self.points[self.edges].mean(axis=1)])
         return Mesh(points, np.concatenate([self.cells, middles], axis=1), sets, self.cell_sets)
 
+    def refined(self) -> Mesh:
+        """Return the linear mesh with each cell divided into 4 (2D) or 8 (3D), at the midpoints of its edges.
+
+        The midpoints follow the points, in the order of :meth:`quadratic`. A point set gains the midpoints between any
+        two of its points, and a cell set the parts of its cells: those of cell c are p c to p c + p - 1.
+        """
+        own = self.quadratic()
+        parts = len(own.shape.parts)
+        sets = {name: (parts * members[:, None] + np.arange(parts)).ravel() for name, members in self.cell_sets.items()}
+        return Mesh(own.points, own.linear_cells, own.point_sets, sets)
+
     def with_midpoints(self, members: np.ndarray) -> np.ndarray:
         """Return points of this linear mesh, and the midpoints between them by their numbers in :meth:`quadratic`.
 

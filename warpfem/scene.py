@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
-from warpfem.boundary import Load, Obstacle, Pin, PrescribedMotion, Support, Traction, Vector, is_number
+from warpfem.boundary import Load, Obstacle, Pin, PointForce, PrescribedMotion, Support, Traction, Vector, is_number
 from warpfem.errors import SceneError, source_of, user_code
 from warpfem.materials import HookeanMaterial, Material
 from warpfem.mesh import Mesh
 
 if TYPE_CHECKING:
+    from warpfem.motion import Motion
     from warpfem.solvers.base import Solver
 
 PointField: TypeAlias = Vector | np.ndarray | Callable[[np.ndarray], np.ndarray]
 """One vector for all points, an array (point_count, dim), or a function of the rest points."""
 
+Term = TypeVar("Term")
 
 ELEMENTS = ("linear", "quadratic", "averaged")
 """What a body's cells can be."""
@@ -139,7 +141,7 @@ class Body:
                 f"{nu:g}: take element='linear', which does not lock there"
             )
 
-    def _with_midpoints(self, term: object) -> object:
+    def _with_midpoints(self, term: Term) -> Term:
         """The term with the midpoints between the points of the linear mesh that it lists; sets have theirs."""
         if not isinstance(term, Pin | PrescribedMotion | Traction) or isinstance(term.points, str):
             return term
@@ -148,6 +150,39 @@ class Body:
         except ValueError:
             return term  # refused where its body is named
         return replace(term, points=self.mesh.with_midpoints(members))
+
+    def refined(self) -> Body:
+        """The body with each of its cells divided into 4 (2D) or 8 (3D).
+
+        Forces on points stay where they are, and initial values that are arrays are interpolated linearly.
+        """
+        mesh = self.mesh
+        parts = len(mesh.quadratic().shape.parts)
+
+        def per_point(value: PointField | None) -> PointField | None:
+            if value is None or callable(value):
+                return value
+            array = np.asarray(value)
+            if array.ndim == 1:
+                return array
+            edges = mesh.edges if mesh.order == 1 else mesh.refined().edges  # those that gain a midpoint
+            return np.concatenate([array, array[edges].mean(axis=1)])
+
+        def term(own: Term) -> Term:
+            if isinstance(own, PointForce):  # on the same points, whatever their set gains
+                return replace(own, points=mesh.select_points(own.points))
+            return own if mesh.order == 2 else self._with_midpoints(own)
+
+        return replace(
+            self,
+            mesh=mesh.refined(),
+            material=self.material.repeated(parts),
+            density=np.repeat(self.density, parts) if isinstance(self.density, np.ndarray) else self.density,
+            supports=[term(own) for own in self.supports],
+            loads=[term(own) for own in self.loads],
+            displacement=per_point(self.displacement),
+            velocity=per_point(self.velocity),
+        )
 
     def initial_displacement(self) -> np.ndarray:
         """Initial displacement, (point_count, dim) float64 [m]."""
@@ -199,6 +234,9 @@ class Scene:
         frames: frames to simulate after the initial one, >= 0.
         up_axis: "Y" or "Z": which way is up in the USD file.
         color_by: "von_mises" or "jacobian": the quantity that colours the bodies in the USD file.
+        quantities: numbers of the motion that matter, by name, each a function of a :class:`warpfem.motion.Motion`
+            (``warpfem.quantities`` has the usual ones): ``warpfem trade`` measures their errors, and a plain run does
+            not compute them.
     """
 
     bodies: Sequence[Body]
@@ -211,6 +249,7 @@ class Scene:
     frames: int = 48
     up_axis: Literal["Y", "Z"] = "Y"
     color_by: Literal["von_mises", "jacobian"] = "von_mises"
+    quantities: Mapping[str, Callable[[Motion], float]] = field(default_factory=dict)
     dim: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -247,6 +286,17 @@ class Scene:
                 raise SceneError(f"an obstacle must be a Plane, Sphere or BoxWalls, not {obstacle!r}")
             vector = getattr(obstacle, "point", getattr(obstacle, "center", getattr(obstacle, "lower", ())))
             self._check_vector(f"{type(obstacle).__name__}: its place", vector)
+        self._check_quantities()
+
+    def _check_quantities(self) -> None:
+        if not isinstance(self.quantities, Mapping):
+            raise SceneError(f"quantities must be a dict from names to functions, not {self.quantities!r}")
+        for name, quantity in self.quantities.items():
+            if not isinstance(name, str) or not name.strip() or not callable(quantity):
+                raise SceneError(
+                    f"quantities must map names to functions of a motion, such as "
+                    f"quantities.final_displacement('body', at=(0, 0, 0), axis=1), not {name!r} to {quantity!r}"
+                )
 
     def _check_number(self, name: str, value: object, positive: bool = False) -> None:
         if not is_number(value) or value < 0.0 or (positive and value == 0.0):  # type: ignore[operator]

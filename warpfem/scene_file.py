@@ -41,6 +41,16 @@ def load_scene(path: str | Path, settings: Mapping[str, str] | None = None) -> S
     return scene
 
 
+def scene_parameters(path: str | Path) -> Mapping[str, inspect.Parameter]:
+    """The parameters of a scene file's function ``scene``, by name.
+
+    Raises:
+        SceneError: as :func:`load_scene`.
+    """
+    path = Path(path)
+    return _parameters(path, _scene_function(path))
+
+
 def _scene_function(path: Path) -> Callable[..., Any]:
     if not os.path.isfile(path):  # unlike the path's own method it bears any name
         raise SceneError(f"no scene file '{path}'")
@@ -72,11 +82,15 @@ def _call(path: Path, action: Callable[[], Any]) -> Any:
             sys.path.remove(folder)
 
 
-def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:
+def _parameters(path: Path, function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
     try:
-        parameters = inspect.signature(function).parameters
+        return inspect.signature(function).parameters
     except (TypeError, ValueError) as error:
         raise SceneError(f"{path}: scene must be a function scene(**parameters) -> Scene, not {function!r}") from error
+
+
+def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, str]) -> dict[str, Any]:
+    parameters = _parameters(path, function)
     arguments = {}
     for name, text in settings.items():
         if name not in parameters:
@@ -84,14 +98,25 @@ def _arguments(path: Path, function: Callable[..., Any], settings: Mapping[str, 
             hint = f"; did you mean '{close[0]}'?" if close else "."
             known = ", ".join(str(p) for p in parameters.values()) or "none"
             raise SceneError(f"{path}: scene() has no parameter '{name}'{hint} It has: {known}")
-        arguments[name] = _value(path, name, text, parameters[name].default)
+        arguments[name] = value_of(path, name, text, parameters[name].default)
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in arguments:
             raise SceneError(f"{path}: parameter '{name}' has no default: give it with --set {name}=VALUE")
     return arguments
 
 
-def _value(path: Path, name: str, text: str, default: Any) -> Any:
+def value_of(owner: str | Path, name: str, text: str, default: Any) -> Any:
+    """What a text says, as a value of the type of the default.
+
+    Args:
+        owner: the scene file, or what else has the value, for messages.
+        name: of the value.
+        text: a Python literal, or any text if the default is one.
+        default: the default.
+
+    Raises:
+        SceneError: it is of another type than the default.
+    """
     if isinstance(default, str):
         return text
     try:
@@ -104,5 +129,5 @@ def _value(path: Path, name: str, text: str, default: Any) -> Any:
         except (TypeError, ValueError, OverflowError):
             pass  # reported below
     if default is not inspect.Parameter.empty and default is not None and type(value) is not type(default):
-        raise SceneError(f"{path}: {name} must be of type {type(default).__name__}, like {default!r}, not {text!r}")
+        raise SceneError(f"{owner}: {name} must be of type {type(default).__name__}, like {default!r}, not {text!r}")
     return value

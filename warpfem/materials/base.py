@@ -90,6 +90,17 @@ class Material(ABC):
         rows = np.stack(np.broadcast_arrays(*columns), axis=-1)
         return np.atleast_2d(rows)
 
+    def repeated(self, count: int) -> "Material":
+        """The material of a mesh whose cells have been divided into ``count`` each, those of a cell together."""
+        if all(np.ndim(value) == 0 for value in self.parameters()):
+            return self
+        return self._with_parameters(
+            [np.repeat(value, count) if np.ndim(value) else value for value in self.parameters()]
+        )
+
+    def _with_parameters(self, values: list[Parameter]) -> "Material":
+        raise MaterialError(f"{type(self).__name__} does not say how to give it other parameters per cell")
+
 
 @dataclass(frozen=True, eq=False)
 class HookeanMaterial(Material):
@@ -141,6 +152,9 @@ class HookeanMaterial(Material):
 
     def parameters(self) -> tuple[Parameter, ...]:
         return self.moduli.mu, self.moduli.lam
+
+    def _with_parameters(self, values: list[Parameter]) -> "HookeanMaterial":
+        return type(self)(mu=values[0], lam=values[1])
 
     def with_lam(self, lam: Parameter) -> "HookeanMaterial":
         """The material of the same shear modulus with another ``lam`` [Pa]."""

@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -174,3 +174,6 @@ class EnergyMaterial(Material):
 
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(self.values.values())
+
+    def _with_parameters(self, values: list[Parameter]) -> "EnergyMaterial":
+        return replace(self, values=dict(zip(self.values, values, strict=True)))

@@ -1,0 +1,179 @@
+"""Whether ``warpfem tune`` finds what a sweep would: true errors of its settings, and their cost beside the best's.
+
+    python benchmarks/tuning.py                      # all cases: an hour or two
+    python benchmarks/tuning.py --case cantilever:10%
+
+Each case is a shipped scene and an error. Errors are measured against a much finer run of its own, which tuning does
+not see. The sweep has all combinations of meshes, cells, schemes and steps of its table, and its best is the fastest of
+those whose error is within the target by that same run. Both are timed in turn. Runs are kept in ``--folder``: what was
+interrupted goes on. The last line counts the cases within the target, and those at no more than twice the best's cost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpfem.errors import SimulationError
+from warpfem.trade.axes import mesh_control
+from warpfem.trade.executors import local_executor
+from warpfem.trade.machine import facts
+from warpfem.trade.problem import FORCED, Problem, Setting
+from warpfem.trade.reference import relative
+from warpfem.trade.store import Store
+from warpfem.trade.study import Point, Study, difference
+from warpfem.trade.tune import tune
+
+SCENES = Path(__file__).parent.parent / "scenes"
+
+STEPS = (1, 4)
+"""Steps of a frame in sweeps."""
+
+SCHEMES = ("linearised", "backward_euler", "sdirk2")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, the errors asked for, the meshes of its sweep and the mesh of the run that is taken for true.
+
+    Attributes:
+        scene: its name.
+        errors: relative, of the motion.
+        cells: values of its parameter ``cells`` in the sweep.
+        true_cells: that of the true motion, of quadratic cells.
+    """
+
+    scene: str
+    errors: tuple[float, ...]
+    cells: tuple[int, ...]
+    true_cells: int
+
+
+CASES = (
+    Case("cantilever", (0.1, 0.01), (1, 2, 4, 8), 6),
+    Case("twist", (0.1, 0.01), (1, 2, 4, 8), 6),
+    Case("jelly_drop", (0.1,), (2, 3, 6, 12), 14),
+    Case("stretch", (0.1, 0.01), (1, 2, 4, 8), 8),
+    Case("two_materials", (0.1, 0.01), (1, 2, 4, 8), 8),
+    Case("custom_material", (0.1, 0.01), (1, 2, 4, 8), 12),
+)
+
+
+def sweep_settings(case: Case) -> list[Setting]:
+    """All settings of a case's sweep."""
+    times = [{f"{FORCED}solver": "velocity_verlet", f"{FORCED}dt": "auto"}]
+    times += [
+        {f"{FORCED}solver": scheme, f"{FORCED}dt": f"1/{steps * fps_of(case)}"} for scheme in SCHEMES for steps in STEPS
+    ]
+    return [
+        Setting.of(cells=cells, **{f"{FORCED}element": element}, **own)
+        for cells in case.cells
+        for element in ("linear", "quadratic")
+        for own in times
+    ]
+
+
+def fps_of(case: Case) -> int:
+    return round(Problem.of(SCENES / f"{case.scene}.py").build(Setting()).scene.fps)
+
+
+def true_setting(case: Case) -> Setting:
+    """The finest run: explicit steps in float64, of quadratic cells."""
+    own = {"element": "quadratic", "solver": "velocity_verlet", "dt": "auto"}
+    return Setting.of(cells=case.true_cells, dtype="float64", **{f"{FORCED}{name}": v for name, v in own.items()})
+
+
+def measure(case: Case, target: float, folder: Path, limit: float, repeats: int) -> dict:
+    """Tunes, sweeps and compares."""
+
+    def say(text: str) -> None:
+        print(f"  {text}", flush=True)
+
+    problem = Problem.of(SCENES / f"{case.scene}.py")
+    with local_executor(1) as pool:
+        study = Study(problem, Store(folder / case.scene), pool, limit=limit, say=say)
+        start = time.perf_counter()
+        record: dict = {"scene": case.scene, "error": target}
+        try:
+            found = tune(study, mesh_control(problem), "l2", target, repeats=1)
+        except SimulationError as error:
+            return record | {"refusal": str(error)}
+        record |= {"tuning_seconds": time.perf_counter() - start, "tried": found.tried}
+        patient = Study(problem, study.store, pool, limit=10.0 * limit, say=say)
+        (true,) = patient.solve([true_setting(case)])
+        if true.failure:
+            return record | {"refusal": f"no true motion: {true.failure}"}
+
+        def error_of(point: Point) -> float:
+            if point.failure:
+                return math.inf
+            return relative(difference(point.first, true.first), found.reference.scales)["l2"]
+
+        quick = 4.0 * max(found.point.seconds, 1.0) + 5.0  # what takes longer cannot be the best
+        points = Study(problem, study.store, pool, limit=quick, say=say).run(sweep_settings(case))
+        within = sorted((p for p in points if error_of(p) <= target), key=lambda p: p.seconds)
+        near = [p.setting for p in within if p.seconds <= 1.5 * within[0].seconds][:4]
+        own, *others = study.run([found.setting, *near], repeats)
+        best = min(others, key=lambda p: p.seconds, default=None)
+        record |= {
+            "setting": found.setting.label,
+            "seconds": own.seconds,
+            "estimated_error": found.error,
+            "true_error": error_of(own),
+            "band": found.band,
+            "sweep": len(points),
+            "best": best and best.setting.label,
+            "best_seconds": best and best.seconds,
+            "best_error": best and error_of(best),
+            "ratio": best and own.seconds / best.seconds,
+        }
+    return record
+
+
+def row(record: dict) -> str:
+    """A line for people."""
+    head = f"{record['scene']} {100 * record['error']:g} %: "
+    if "refusal" in record:
+        return head + f"refused: {record['refusal']}"
+    best = "the sweep has none within it"
+    if record["best"]:
+        best = f"{record['ratio']:.2f} times {record['best']} ({record['best_seconds']:.3g} s)"
+    return (
+        f"{head}{record['setting']}: true error {100 * record['true_error']:.2g} %, {record['seconds']:.3g} s, {best}; "
+        f"tried {record['tried']}, sweep {record['sweep']}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", action="append", default=[], metavar="SCENE[:E]", help="only these")
+    parser.add_argument("--folder", type=Path, default=Path("output") / "tuning", help="default: %(default)s")
+    parser.add_argument("--limit", type=float, default=100.0, help="wall time of a run [s] (default: %(default)s)")
+    parser.add_argument("--repeats", type=int, default=3, help="processes that time each (default: %(default)s)")
+    parser.add_argument("--json", type=Path, help="file of the results")
+    arguments = parser.parse_args()
+    os.environ.setdefault("PYTHONUNBUFFERED", "1")
+    records = []
+    for case in CASES:
+        for target in case.errors:
+            names = {case.scene, f"{case.scene}:{100 * target:g}%"}
+            if arguments.case and not names & set(arguments.case):
+                continue
+            records.append(measure(case, target, arguments.folder, arguments.limit, arguments.repeats))
+            print(row(records[-1]), flush=True)
+    found = [record for record in records if "refusal" not in record]
+    within = sum(record["true_error"] <= record["error"] for record in found)
+    cheap = sum(record["ratio"] is None or record["ratio"] <= 2.0 for record in found)
+    print(f"{within} of {len(found)} within the error, {cheap} at no more than twice the sweep's best", end="")
+    print(f"; {len(records) - len(found)} refused")
+    if arguments.json:
+        arguments.json.write_text(json.dumps({"machine": facts(), "cases": records}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

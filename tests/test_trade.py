@@ -1,0 +1,449 @@
+"""The trade between speed and accuracy: settings, errors, references, fronts, and studies that go on."""
+
+import csv
+import json
+import os
+import signal
+import threading
+import time
+from concurrent.futures import Executor, Future
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warpfem as wf
+from warpfem.cli import FAILED, OK, WRONG_USE, main
+from warpfem.errors import OutputError, SceneError, SimulationError
+from warpfem.trade.axes import kind_of, mesh_control, parse_axes, settings_of
+from warpfem.trade.executors import cluster_executor, local_executor
+from warpfem.trade.extrapolation import MOST_ORDER, extrapolate, observed_order
+from warpfem.trade.front import answer, candidates, front
+from warpfem.trade.ladders import Part
+from warpfem.trade.measure import measure
+from warpfem.trade.outcome import Order, Outcome
+from warpfem.trade.problem import Problem, Setting
+from warpfem.trade.process import run_order
+from warpfem.trade.reference import Reference, build_reference
+from warpfem.trade.store import Store
+from warpfem.trade.study import Point, Study, difference
+
+BAR = """
+import warpfem as wf
+
+def scene(cells: int = 2, E: float = 1e5, dt: float = 1 / 40, kind: str = "soft") -> wf.Scene:
+    mesh = wf.Mesh.rectangle((2, 1), (2 * cells, cells))
+    bar = wf.Body("bar", mesh, wf.LinearElasticity(E=E, nu=0.3), supports=[wf.Pin("left")])
+    tip = wf.quantities.final_displacement("bar", at=(2, 0.5), axis=1)
+    return wf.Scene([bar], wf.BackwardEuler(), dt=dt, gravity=(0, -1), damping=5.0, fps=20, frames=8,
+                    quantities={"tip": tip})
+"""
+
+
+@pytest.fixture
+def bar(tmp_path) -> Path:
+    path = tmp_path / "bar.py"
+    path.write_text(BAR)
+    return path
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Settings run in this process, which is quicker."""
+    monkeypatch.setattr("warpfem.trade.study.run_order", measure)
+    monkeypatch.setattr("warpfem.trade.measure.LONG", 0.0)
+
+
+class Here(Executor):
+    """Runs what it is given at once; fails as told."""
+
+    def __init__(self, errors: list[BaseException | None] = ()) -> None:
+        self.errors = list(errors)
+        self.labels: list[str] = []
+
+    def submit(self, function, order):
+        future: Future = Future()
+        error = self.errors.pop(0) if self.errors else None
+        if isinstance(error, KeyboardInterrupt):
+            raise error
+        if error is not None:
+            future.set_exception(error)
+        else:
+            self.labels.append(order.setting.label)
+            future.set_result(function(order))
+        return future
+
+
+def fake(order: Order) -> Outcome:
+    """An outcome whose error is 1 / cells^2, at a cost of cells^3."""
+    cells = int(order.setting.get("cells", "2"))
+    motion = np.full((3, 4, 2), 1.0 + cells**-2.0)
+    times = np.arange(3.0)
+    return Outcome(load=order.load, seconds=[0.01 * cells**3], mesh_size=1.0 / cells, times=times, motion=motion)
+
+
+# ---- settings
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cells", "--axis takes NAME=VALUE"),
+        ("cells=", "--axis takes NAME=VALUE"),
+        ("cels=1,2", "no axis 'cels'; did you mean 'cells'"),
+        ("tolerence=1e-3", "did you mean 'tolerance'"),
+        ("frames=3,4", "frames is no axis"),
+    ],
+)
+def test_axes_that_there_are_not(bar, text, message):
+    with pytest.raises(SceneError, match=message):
+        parse_axes([text], Problem.of(bar))
+
+
+def test_settings_are_all_combinations_without_what_does_not_apply(bar):
+    problem = Problem.of(bar)
+    axes = parse_axes(["solver=BackwardEuler,velocity_verlet", "tolerance=1e-2,1e-4", "dt=1/40"], problem)
+    labels = [setting.label for setting in settings_of(axes, problem)]
+    assert labels == [
+        "solver=BackwardEuler tolerance=1e-2 dt=1/40",
+        "solver=BackwardEuler tolerance=1e-4 dt=1/40",
+        "solver=velocity_verlet dt=1/40",  # explicit steps have no tolerance: once is enough
+    ]
+    with pytest.raises(SceneError, match="given twice"):
+        parse_axes(["cells=1", "cells=2"], problem)
+
+
+def test_a_setting_makes_its_scene(bar):
+    problem = Problem.of(bar, {"E": "2e5"}, frames=3)
+
+    def scene(**values):
+        return problem.build(Setting.of(**values)).scene
+
+    plain = scene()
+    assert plain.frames == 3
+    assert plain.bodies[0].material.E == pytest.approx(2e5)
+    assert scene(cells=4).bodies[0].mesh.cell_count == 64
+    assert scene(dt="1/80").dt == 1 / 80
+    assert scene(dt="auto").dt == "auto"  # although the parameter is a number
+    assert scene(element="P2").bodies[0].mesh.order == 2
+    assert scene(refine=1).bodies[0].mesh.cell_count == 4 * plain.bodies[0].mesh.cell_count
+    swapped = scene(material="NeoHookean").bodies[0].material
+    assert isinstance(swapped, wf.NeoHookean)
+    assert (swapped.E, swapped.nu) == pytest.approx((2e5, 0.3))
+    tight = scene(solver="sdirk2", tolerance="1e-7").solver
+    assert tight == wf.SDIRK2(tolerance=1e-7)
+    assert scene(solver="linearised").solver == wf.BackwardEuler.linearised()
+    assert problem.build(Setting.of(dtype="float64")).dtype == "float64"
+    for values, message in (
+        ({"material": "NeoHokean"}, "did you mean 'NeoHookean'"),
+        ({"element": "cubic"}, "element must be one of"),
+        ({"refine": "-1"}, "refine must be"),
+        ({"dtype": "float16"}, "dtype must be"),
+        ({"dt": "soon"}, "must be of type float"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            scene(**values)
+
+
+def test_the_parameters_that_set_the_mesh_are_found(bar, tmp_path):
+    problem = Problem.of(bar)
+    mesh = mesh_control(problem)
+    assert mesh.names == {"cells", "refine"}
+    assert mesh.finer(Setting(), 2.0) == Setting.of(cells=4)
+    assert mesh.finer(Setting.of(cells=1), 0.5) is None
+    assert [kind_of(name, mesh) for name in ("cells", "dt", "dtype", "scene.tolerance", "E", "material")] == [
+        "space",
+        "time",
+        "algebra",
+        "algebra",
+        "model",
+        "model",
+    ]
+    path = tmp_path / "by_length.py"
+    path.write_text(BAR.replace("cells: int = 2", "edge: float = 0.5").replace("2 * cells, cells", "int(2 / edge), 2"))
+    by_length = mesh_control(Problem.of(path))
+    assert by_length.finer(Setting(), 2.0) == Setting.of(edge=0.25)
+    path = tmp_path / "fixed.py"
+    path.write_text(BAR.replace("cells: int = 2, ", "").replace("2 * cells, cells", "2, 1"))
+    fixed = mesh_control(Problem.of(path))
+    assert fixed.finer(Setting(), 2.0) == Setting.of(refine=1)
+    assert fixed.finer(Setting(), 0.5) is None
+
+
+# ---- extrapolation
+
+
+@pytest.mark.parametrize("p", [0.8, 2.0, 3.0])
+def test_the_limit_of_a_power_law_is_found_and_its_order(p):
+    sizes = [1.0, 0.5, 0.3]
+    levels = [np.array([[2.0 + 0.7 * h**p, -1.0 + 0.2 * h**p]]) for h in sizes]
+    found = extrapolate(levels, sizes)
+    assert found.order == pytest.approx(p, rel=1e-6)
+    np.testing.assert_allclose(found.value, [[2.0, -1.0]], rtol=1e-6)
+    missing = 0.3**p * np.hypot(0.7, 0.2)
+    assert found.band == pytest.approx(0.5 * missing, rel=1e-6)  # no more is claimed
+
+
+@pytest.mark.parametrize(
+    ("values", "remark"),
+    [
+        ([1.0, 2.0, 3.0], "does not converge"),
+        ([1.0, 3.0, 2.0], "do not go the same way"),
+        ([1.0, 2.0, 2.9], "order below"),
+    ],
+)
+def test_nothing_is_extrapolated_from_what_does_not_converge(values, remark):
+    found = extrapolate([np.array([value]) for value in values], [1.0, 0.5, 0.25])
+    assert found.order is None
+    assert remark in found.remark
+    assert found.value == values[-1]
+    assert found.band >= abs(values[-1] - values[-2])
+
+
+def test_orders_have_bounds():
+    assert observed_order(1.01, [1.0, 0.5, 0.25]) is None
+    assert observed_order(1e9, [1.0, 0.5, 0.25]) == MOST_ORDER
+    assert extrapolate([np.ones(1), np.ones(1) * 1.5], [1.0, 0.5]).band == 0.5
+    assert "rounding" in extrapolate([np.zeros(1), np.ones(1), np.ones(1)], [1.0, 0.5, 0.2]).remark
+
+
+# ---- fronts
+
+
+def reference(band: float, target: float = 1.0) -> Reference:
+    outcome = Outcome(times=np.arange(1.0), motion=np.full((1, 1, 1), target), quantities={"tip": target})
+    parts = {"l2": {"space": Part(2.0, band)}, "tip": {"space": Part(2.0, band)}}
+    return Reference(outcome, {"l2": target, "tip": target}, parts, {}, {})
+
+
+def point(error: float, seconds: float) -> Point:
+    outcome = Outcome(seconds=[seconds], times=np.arange(1.0), motion=np.full((1, 1, 1), 1.0 + error))
+    return Point(Setting.of(cells=int(1 / error)), (outcome,))
+
+
+def test_the_front_and_its_answers():
+    points = [point(0.2, 1.0), point(0.05, 2.0), point(0.1, 3.0), point(0.008, 20.0), point(0.001, 400.0)]
+    points.append(Point(Setting.of(cells=9), (Outcome("no such thing"),)))
+    own = reference(1e-4)
+    ordered = candidates(points, own, "l2")
+    assert [c.seconds for c in front(ordered)] == [1.0, 2.0, 20.0, 400.0]
+    ten = answer(ordered, own, "l2", 0.1)
+    assert (ten.candidate.seconds, ten.next_seconds, ten.next_how) == (2.0, 20.0, "measured")
+    assert "cheapest setting within 10 %" in ten.sentence
+    assert "10 times as much" in ten.sentence
+    one = answer(ordered, own, "l2", 0.009)
+    assert one.candidate.seconds == 20.0
+    assert one.next_how == "extrapolated"
+    assert one.next_seconds > 400.0
+    none = answer(ordered, own, "l2", 5e-4)
+    assert none.candidate is None
+    assert "No setting of the sweep is within 0.05 %" in none.sentence
+    assert "the reference itself may be off by 0.01 %" in answer(ordered, own, "l2", 2e-4).sentence
+    assert "every setting failed" in answer([], own, "l2", 0.1).sentence
+    assert candidates(points, own, "tip") == []  # no setting has a value of it
+
+
+def test_a_setting_counts_as_within_an_error_by_its_bound():
+    own = reference(2e-3)
+    ordered = candidates([point(0.0095, 1.0), point(0.005, 2.0)], own, "l2")
+    assert answer(ordered, own, "l2", 0.01).candidate.seconds == 2.0
+
+
+# ---- studies
+
+
+def study(bar: Path, folder: Path, executor: Executor, **options) -> Study:
+    return Study(Problem.of(bar), Store(folder), executor, **options)
+
+
+def test_a_study_goes_on_from_what_it_has(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    settings = [Setting.of(cells=cells) for cells in (1, 2, 3, 4)]
+    interrupted = Here([None, None, KeyboardInterrupt()])
+    first = study(bar, tmp_path / "a", interrupted)
+    monkeypatch.setattr(first, "_run_each", lambda s, rounds: one_by_one(interrupted, first, s))
+    with pytest.raises(KeyboardInterrupt):
+        first.run(settings, 2)
+    with open(tmp_path / "a" / "runs.jsonl", "ab") as file:
+        file.write(b'{"key": "cut sho')  # as a kill in the middle of a line leaves it
+    rest = Here()
+    points = study(bar, tmp_path / "a", rest).run(settings, 2)
+    assert interrupted.labels == ["cells=1", "cells=2"]
+    assert rest.labels == ["cells=3", "cells=4", "cells=1", "cells=2", "cells=3", "cells=4"]
+    assert [len(point.samples) for point in points] == [2, 2, 2, 2]
+    nothing = Here()
+    again = study(bar, tmp_path / "a", nothing).run(settings, 2)
+    assert nothing.labels == []
+    assert [point.seconds for point in again] == [point.seconds for point in points]
+    assert difference(again[0].first, points[1].first).l2 == pytest.approx(np.sqrt(2.0) * (1 - 1 / 4))
+    bar.write_text(BAR + "# changed\n")
+    changed = Here()
+    study(bar, tmp_path / "a", changed).run(settings[:1])
+    assert changed.labels == ["cells=1"]
+
+
+def one_by_one(executor, own, settings):
+    """Outcomes come while later settings are not submitted yet, as with one worker."""
+    for setting in settings:
+        order = Order(own.problem, setting, own.places, 1, 1.0, own.load)
+        yield setting, executor.submit(fake, order).result()
+
+
+def test_times_under_load_are_not_mixed_with_others(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    setting = Setting.of(cells=2)
+    busy, alone, more = Here(), Here(), Here()
+    study(bar, tmp_path, busy, load="parallel").run([setting], 3)
+    (point,) = study(bar, tmp_path, alone).run([setting], 1)
+    assert len(alone.labels) == 1
+    assert {outcome.load for outcome in point.outcomes} == {"serial"}
+    study(bar, tmp_path, more).solve([setting])  # for its motion any load will do
+    study(bar, tmp_path, more, load="parallel").solve([setting])
+    assert more.labels == []
+
+
+def test_what_a_lost_worker_had_in_hand_is_submitted_again(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    said = []
+    twice = Here([RuntimeError("gone"), RuntimeError("gone")])
+    (point,) = study(bar, tmp_path, twice, say=said.append).run([Setting()])
+    assert not point.failure
+    assert sum("worker was lost" in text for text in said) == 2
+    lost = Here([RuntimeError("gone")] * 9)
+    with pytest.raises(OutputError, match="3 workers were lost"):
+        study(bar, tmp_path, lost).run([Setting.of(cells=3)])
+
+
+def test_failures_are_results(bar, tmp_path):
+    """A crash, a hang, an end, a scene that is no scene, and steps that are too long."""
+    actions = {
+        "die": "import os; os.kill(os.getpid(), 9)",
+        "hang": "import time; time.sleep(60)",
+        "end": "import os; os._exit(3)",
+        "raise": "1 / 0",
+    }
+    body = "".join(f"    if kind == '{name}':\n        {action}\n" for name, action in actions.items())
+    bar.write_text(BAR.replace("    mesh =", f"{body}    mesh ="))
+    reasons = {}
+    for setting in [*(Setting.of(kind=name) for name in actions), Setting.of(solver="velocity_verlet", E=1e7)]:
+        order = Order(Problem.of(bar), setting, [np.array([[1.0, 0.5]])], 1, 5.0, "serial")
+        reasons[setting.label] = run_order(order).failure
+    for name, reason in {
+        "kind=die": "killed by SIGKILL",
+        "kind=hang": "out of time: more than 5 s",
+        "kind=end": "ended with status 3",
+        "kind=raise": "ZeroDivisionError",
+        "solver=velocity_verlet E=10000000.0": "above the stability limit",
+    }.items():
+        assert reason in reasons[name]
+
+
+def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_process):
+    own = study(bar, tmp_path / "a", Here())
+    settings = [Setting.of(cells=1, element="P2", dt="1/20"), Setting.of(cells=2, element="P1", dt="1/20")]
+    asked = own.run(settings)
+    found = build_reference(own, mesh_control(own.problem), asked)
+    exact = {"dtype": "float64", "solver": "sdirk3", "dt": "1/80", "tolerance": "1e-8"}
+    (truth,) = own.run([Setting.of(cells=10, element="P2", **exact)])
+    assert not truth.failure
+    best = min(found.errors(point.first)["l2"] for point in asked)
+    for name in ("l2", "max", "tip"):
+        assert found.errors(truth.first)[name] <= found.band(name)
+    assert found.band("l2") <= best / 4.0
+    assert 1.0 < found.parts["l2"]["space"].order < 4.0
+    assert 1.0 < found.parts["l2"]["time"].order < 4.0
+
+
+def test_nothing_is_measured_where_nothing_moves(bar, tmp_path, in_process):
+    bar.write_text(BAR.replace("gravity=(0, -1)", "gravity=None"))
+    own = study(bar, tmp_path / "a", Here())
+    with pytest.raises(SimulationError, match="nothing moves"):
+        build_reference(own, mesh_control(own.problem), own.run([Setting()]))
+
+
+def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, capsys):
+    pytest.importorskip("matplotlib")
+    out = tmp_path / "out"
+    arguments = ["trade", str(bar), "--axis", "cells=1,2", "--axis", "element=P1,P2", "--axis", "dt=1/20"]
+    arguments += ["--axis", "material=linear,Neo", "--error", "10%", "--repeats", "1", "--out", str(out)]
+    assert main(arguments) == OK
+    printed = capsys.readouterr().out
+    assert "failed: 4 settings with dt=1/20 material=Neo: there is no material 'Neo'" in printed
+    assert "observed order" in printed
+    assert "The cheapest setting within 10 % of the motion (L2) is" in printed
+    data = json.loads((out / "trade.json").read_text())
+    assert len(data["settings"]) == 8
+    edge = [record for record in data["settings"] if record["on_front"]]
+    most = max(edge, key=lambda record: record["errors"]["l2"])
+    parts = {kind: errors["l2"] for kind, errors in most["parts"].items()}
+    assert set(parts) == {"space", "time", "algebra", "model"}
+    assert sum(parts.values()) == pytest.approx(most["errors"]["l2"], rel=0.3)
+    assert parts["space"] > 10.0 * parts["algebra"]
+    assert parts["model"] == 0.0
+    with open(out / "trade.csv") as file:
+        table = list(csv.DictReader(file))
+    assert [row["failure"] != "" for row in table] == [record["failure"] != "" for record in data["settings"]]
+    assert float(table[0]["error_l2"]) == data["settings"][0]["errors"]["l2"]
+    for name in ("trade.png", "trade.svg"):
+        assert (out / name).stat().st_size > 10_000
+    lines = (out / "runs.jsonl").read_text().count("\n")
+    assert main([*arguments, "--quantity", "tip", "--json"]) == OK
+    again = json.loads(capsys.readouterr().out)
+    assert again["quantity"] == "tip"
+    assert (out / "runs.jsonl").read_text().count("\n") - lines < 20  # only what the other quantity still needs
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["trade", "missing.py"], "no scene file"),
+        (["trade", "bar.py", "--axis", "cels=1"], "did you mean 'cells'"),
+        (["trade", "bar.py", "--quantity", "tipp"], "there is no quantity 'tipp'"),
+    ],
+)
+def test_wrong_use_is_said_before_anything_is_run(bar, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == WRONG_USE
+    assert message in capsys.readouterr().err
+
+
+def test_a_study_whose_every_setting_fails_says_so(bar, tmp_path, in_process, capsys):
+    assert main(["trade", str(bar), "--axis", "element=cubic", "--out", str(tmp_path / "out")]) == FAILED
+    assert "No reference: there is no reference: every setting failed" in capsys.readouterr().out
+
+
+def test_an_interrupt_ends_the_processes(bar, tmp_path):
+    bar.write_text(BAR.replace("    mesh =", "    if kind == 'hang':\n        import time; time.sleep(60)\n    mesh ="))
+    start = time.monotonic()
+    threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt), local_executor(2) as pool:
+        study(bar, tmp_path / "a", pool, load="parallel").run([Setting.of(kind="hang"), Setting.of(kind="hang", E=2e5)])
+    assert time.monotonic() - start < 30.0
+
+
+def test_a_cluster_loses_a_worker_and_no_result(bar, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    settings = [Setting.of(cells=1, dt=f"1/{20 * n}") for n in range(1, 7)]
+    lost = []
+    with distributed.LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        worker = next(iter(cluster.workers.values())).pid
+
+        def kill_after_the_first(text: str) -> None:
+            if not lost:
+                lost.append(worker)
+                os.kill(worker, signal.SIGKILL)
+
+        with cluster_executor(cluster.scheduler_address) as pool:
+            own = study(bar, tmp_path / "a", pool, load="parallel", threads=1, say=kill_after_the_first)
+            points = own.run(settings)
+    assert lost
+    assert [point.failure for point in points] == [""] * len(settings)
+    assert {point.first.load for point in points} == {"parallel"}
+    assert len({point.first.steps for point in points}) == len(settings)
+
+
+def test_no_scheduler_is_a_clear_error(monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("warpfem.trade.executors.PATIENCE", "1s")
+    with pytest.raises(OutputError, match="no Dask scheduler"), cluster_executor("tcp://127.0.0.1:1"):
+        pass

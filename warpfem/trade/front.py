@@ -1,0 +1,184 @@
+"""The front of a study: the settings that no other one beats in both time and error, and what they answer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from warpfem.trade.reference import Reference
+from warpfem.trade.study import Point
+
+NEXT = 10.0
+"""The factor of accuracy whose price is told."""
+
+RESOLVED = 0.25
+"""The largest part of an error that the reference's band may be for the error to be more than a bound."""
+
+
+TAIL = 30.0
+"""Errors over the smallest one of a front that belong to the part that is extrapolated."""
+
+LEAST_TAIL = 3
+"""Settings of a front, if it has so many, that belong to that part whatever their errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A setting with its cost and its error.
+
+    Attributes:
+        point: the setting and its runs.
+        error: relative, against the reference.
+        band: what the error may be off by: the reference's.
+    """
+
+    point: Point
+    error: float
+    band: float
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of its steps [s]."""
+        return self.point.seconds
+
+    @property
+    def bound(self) -> float:
+        """The largest that the error may be."""
+        return self.error + self.band
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the error is more than a bound."""
+        return self.band <= RESOLVED * self.error
+
+
+def candidates(points: Sequence[Point], reference: Reference, name: str) -> list[Candidate]:
+    """The settings that have an error of that name, from the fastest to the slowest."""
+    band = reference.band(name)
+    found = [(point, reference.errors(point.first).get(name)) for point in points if not point.failure]
+    known = [Candidate(point, error, band) for point, error in found if error is not None]
+    return sorted(known, key=lambda own: (own.seconds, own.error))
+
+
+def front(ordered: Sequence[Candidate]) -> list[Candidate]:
+    """Those that are more accurate than all faster ones."""
+    kept: list[Candidate] = []
+    for candidate in ordered:
+        if not kept or candidate.error < kept[-1].error:
+            kept.append(candidate)
+    return kept
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The cheapest setting within an error, and the price of the next factor of ten.
+
+    Attributes:
+        name: of the norm or quantity.
+        target: the relative error asked for.
+        refusal: why there is no answer; empty if there is one.
+        candidate: the cheapest setting within the error; ``None`` if none is.
+        closest: the most accurate setting, where none is.
+        next_seconds: time of a setting within a tenth of the error [s]; where none is within the error, of one within
+            it; ``None`` if the front does not tell.
+        next_how: whether that was measured or extrapolated along the front.
+    """
+
+    name: str
+    target: float
+    refusal: str = ""
+    candidate: Candidate | None = None
+    closest: Candidate | None = None
+    next_seconds: float | None = None
+    next_how: Literal["measured", "extrapolated", ""] = ""
+
+    @property
+    def sentence(self) -> str:
+        """The answer for people."""
+        asked = f"{percent(self.target)} of {label(self.name)}"
+        if self.refusal:
+            return f"No answer for {asked}: {self.refusal}"
+        price = "what that would cost, the front does not tell"
+        if self.next_seconds is not None:
+            seconds = f"{self.next_seconds:.2g} s"
+            price = f"{'about ' if self.next_how == 'extrapolated' else ''}{seconds} ({self.next_how})"
+        if self.candidate is None:
+            assert self.closest is not None
+            return (
+                f"No setting of the sweep is within {asked}: the most accurate, {self.closest.point.setting.label}, is "
+                f"off by {percent(self.closest.error)} (± {percent(self.closest.band)}) and takes "
+                f"{self.closest.seconds:.2g} s; to get there: {price}"
+            )
+        own = self.candidate
+        least, most = own.point.spread
+        if self.next_seconds is not None:
+            price += f", {self.next_seconds / own.seconds:.2g} times as much"
+        return (
+            f"The cheapest setting within {asked} is {own.point.setting.label}: {own.seconds:.2g} s ({least:.2g} to "
+            f"{most:.2g} s), off by {percent(own.error)} (± {percent(own.band)}); the next factor of {NEXT:g}: {price}"
+        )
+
+
+def answer(ordered: Sequence[Candidate], reference: Reference, name: str, target: float) -> Answer:
+    """The cheapest setting within an error.
+
+    Args:
+        ordered: the settings, from fast to slow.
+        reference: that of their errors.
+        name: of the norm or quantity.
+        target: the relative error asked for.
+    """
+    band = reference.band(name)
+    if not ordered:
+        return Answer(name, target, "every setting failed, or has no value of it")
+    if not band <= RESOLVED * target:
+        return Answer(name, target, f"the reference itself may be off by {percent(band)}. {advice(reference, name)}")
+    edge = front(ordered)
+    within = [own for own in ordered if own.bound <= target]
+    goal = target / NEXT if within else target
+    measured = [own for own in ordered if own.bound <= goal]
+    seconds = measured[0].seconds if measured else _extrapolated(edge, goal)
+    how: Literal["measured", "extrapolated", ""] = "measured" if measured else "extrapolated"
+    if seconds is None:
+        how = ""
+    if within:
+        return Answer(name, target, candidate=within[0], next_seconds=seconds, next_how=how)
+    return Answer(name, target, closest=min(ordered, key=lambda own: own.error), next_seconds=seconds, next_how=how)
+
+
+def advice(reference: Reference, name: str) -> str:
+    """Why a reference is not more accurate, and what to do."""
+    reasons = [f"in {kind}: {part.remark}" for kind, part in reference.parts[name].items() if part.remark]
+    reasons += list(dict.fromkeys(reference.remarks))
+    text = f"Reasons: {'; '.join(reasons)}. " if reasons else ""
+    return (
+        f"{text}Motion that small changes alter for good, such as that after impacts, has no reference: take fewer "
+        "--frames, a quantity that is less sensitive, or more damping; else allow longer runs by --limit"
+    )
+
+
+def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
+    """The time at which the front, continued as a power law from its last part, comes to an error [s]."""
+    tail = [own for own in edge if own.error <= TAIL * edge[-1].error]
+    tail = tail if len(tail) >= LEAST_TAIL else list(edge[-LEAST_TAIL:])
+    if len(tail) < 2:
+        return None
+    logs = np.log([[own.error, own.seconds] for own in tail])
+    slope, _ = np.polyfit(logs[:, 0], logs[:, 1], 1)
+    if slope >= 0.0:
+        return None
+    return float(math.exp(logs[-1, 1] + slope * (math.log(goal) - logs[-1, 0])))
+
+
+def percent(value: float) -> str:
+    """A relative error for people."""
+    return f"{100.0 * value:.0f} %" if value >= 0.995 else f"{100.0 * value:.2g} %"
+
+
+def label(name: str) -> str:
+    """What an error is of, for people."""
+    return {"l2": "the motion (L2)", "max": "the motion (largest)"}.get(name, f"'{name}'")

@@ -1,0 +1,94 @@
+"""Outcomes on the disk, each written when it comes: a study that was killed goes on with those it has."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpfem.errors import OutputError
+from warpfem.files import replacing
+from warpfem.trade.outcome import Outcome
+from warpfem.trade.problem import Problem, Setting
+
+
+class Store:
+    """The outcomes of a study, in a folder.
+
+    ``runs.jsonl`` has a line for each, and ``motions/KEY.npy`` the recorded motion of each setting, that of its first
+    run without failure: all its runs have the same.
+
+    Args:
+        folder: is made if it does not exist.
+
+    Raises:
+        OutputError: it cannot be written to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._lines = folder / "runs.jsonl"
+        self._outcomes: dict[str, list[Outcome]] = {}
+        try:
+            (folder / "motions").mkdir(parents=True, exist_ok=True)
+            self._read()
+        except OSError as error:
+            raise OutputError(f"cannot use the folder {folder}: {error.strerror or error}") from None
+
+    def outcomes(self, problem: Problem, setting: Setting) -> list[Outcome]:
+        """All outcomes of a setting, in the order in which they came."""
+        return list(self._outcomes.get(problem.key(setting), ()))
+
+    def add(self, problem: Problem, setting: Setting, outcome: Outcome) -> None:
+        """Keeps an outcome.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        key = problem.key(setting)
+        try:
+            motion = self._motion(key)
+            if not outcome.failure and not motion.exists():
+                with replacing(motion) as temporary, open(temporary, "wb") as array:
+                    np.save(array, outcome.motion)
+            record = asdict(replace(outcome, motion=np.zeros(0))) | {"times": outcome.times.tolist()}
+            del record["motion"]
+            line = json.dumps({"key": key, "setting": dict(setting), **record}) + "\n"
+            file = os.open(self._lines, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            try:
+                os.write(file, line.encode())  # at one stroke: a kill leaves all of it or a part that is not read
+                os.fsync(file)
+            finally:
+                os.close(file)
+            if not outcome.failure:
+                outcome.motion = np.load(motion, mmap_mode="r")
+        except OSError as error:
+            raise OutputError(f"cannot write to {self.folder}: {error.strerror or error}") from None
+        self._outcomes.setdefault(key, []).append(outcome)
+
+    def _motion(self, key: str) -> Path:
+        return self.folder / "motions" / f"{key}.npy"
+
+    def _read(self) -> None:
+        known = {field.name for field in fields(Outcome)}
+        text = self._lines.read_bytes() if self._lines.exists() else b""
+        if text and not text.endswith(b"\n"):
+            with open(self._lines, "ab") as file:
+                file.write(b"\n")  # ends the line that a kill cut short
+        for line in text.splitlines():
+            try:
+                record: dict[str, Any] = json.loads(line)
+            except ValueError:
+                continue
+            key = record.get("key", "")
+            outcome = Outcome(**{name: value for name, value in record.items() if name in known})
+            outcome.times = np.array(outcome.times)
+            if not outcome.failure:
+                if not self._motion(key).exists():
+                    continue  # somebody removed it: run it again
+                outcome.motion = np.load(self._motion(key), mmap_mode="r")
+            self._outcomes.setdefault(key, []).append(outcome)
