@@ -27,7 +27,7 @@ from warpfem.trade.reference import Part, Reference, build_reference
 from warpfem.trade.store import Store
 from warpfem.trade.study import Point, Study, difference
 
-BAR = '''
+BAR = """
 import warpfem as wf
 
 def scene(cells: int = 2, E: float = 1e5, dt: float = 1 / 40, kind: str = "soft") -> wf.Scene:
@@ -36,7 +36,7 @@ def scene(cells: int = 2, E: float = 1e5, dt: float = 1 / 40, kind: str = "soft"
     tip = wf.quantities.final_displacement("bar", at=(2, 0.5), axis=1)
     return wf.Scene([bar], wf.BackwardEuler(), dt=dt, gravity=(0, -1), damping=5.0, fps=20, frames=8,
                     quantities={"tip": tip})
-'''
+"""
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.solvers import explicit
+from warpfem.solvers import explicit, implicit
 from warpfem.strips import STRIP, cut_into_strips
 from warpfem.subnormals import SubnormalsFlushed
 from warpfem.threads import Team, share
@@ -72,7 +72,7 @@ def test_the_forces_are_those_of_the_plain_kernel(kind, case):
     state = model.state()
     state.assign(displacement=0.03 * mesh.mean_edge_length * np.random.default_rng(0).normal(size=mesh.points.shape))
     plain = model.internal_force(state)
-    model.vectorize()
+    model.vectorize(explicit.VECTORIZED_CELLS)
     assert model.blocks[0].vectorized is not None
     difference = np.abs(model.internal_force(state) - plain).max()
     assert 0.0 < difference <= limit * np.abs(plain).max()  # equal bits would be those of the plain kernel
@@ -89,7 +89,7 @@ def test_cells_that_the_direct_stress_leaves_out_have_that_of_the_plain_kernel()
     for state, motion in zip(states, motions, strict=True):
         state.assign(displacement=motion)
     expected = [model.internal_force(state) for state in states]
-    model.vectorize()
+    model.vectorize(explicit.VECTORIZED_CELLS)
     known = []
     for state, plain in zip(states, expected, strict=True):
         difference = np.abs(model.internal_force(state) - plain).max()
@@ -106,15 +106,20 @@ def test_small_bodies_and_materials_with_branches_keep_the_plain_kernel():
     small = wf.Model(_scene(MESHES["one cube"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu")
     branching = wf.Model(_scene(MESHES["box"], Branching(E=1e5, nu=0.3)), device="cpu")
     for model in (small, branching):
-        model.vectorize()
+        model.vectorize(explicit.VECTORIZED_CELLS)
         assert model.blocks[0].vectorized is None
 
 
-@pytest.mark.parametrize("solver", [wf.SymplecticEuler(), wf.VelocityVerlet()], ids=["symplectic Euler", "Verlet"])
+@pytest.mark.parametrize(
+    "solver",
+    [wf.SymplecticEuler(), wf.VelocityVerlet(), wf.BackwardEuler()],
+    ids=["symplectic Euler", "Verlet", "backward Euler"],
+)
 def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     """With a body that is large enough for all threads, and one of another material that is too small for that."""
-    monkeypatch.setattr("warpfem.model.VECTORIZED_CELLS", 64)
-    monkeypatch.setattr(explicit, "CELLS_PER_THREAD", 256)
+    for module in (explicit, implicit):
+        monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
+    monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
     monkeypatch.setattr(explicit, "WINDOW", 64)
     mesh = MESHES["box"]
@@ -126,7 +131,8 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         scene = wf.Scene([body, small], solver, gravity=(0, -9.81, 0), damping=1.0)
         model = wf.Model(scene, device="cpu", threads=threads)
         stepper, state = solver.stepper(model), model.state()
-        dt = 0.5 * stepper.stable_dt(state)
+        assert model.team.size == threads and model.blocks[0].vectorized
+        dt = 0.5 * (stepper.stable_dt(state) or 0.02)
         for _ in range(20):
             stepper.step(state, dt)
         results.append((state.displacement, state.velocity))
@@ -138,7 +144,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
 def test_steps_of_vectorised_bodies_follow_those_of_plain_ones(monkeypatch):
     motions = []
     for least in (1, 10**9):
-        monkeypatch.setattr("warpfem.model.VECTORIZED_CELLS", least)
+        monkeypatch.setattr(explicit, "VECTORIZED_CELLS", least)
         model = wf.Model(_scene(MESHES["box"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu")
         state = model.state()
         state.assign(velocity=np.random.default_rng(0).normal(size=state.velocity.shape))

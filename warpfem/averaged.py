@@ -104,16 +104,17 @@ class AveragedBlock(CellBlock):
     def arrays(self) -> list[wp.array]:
         return [*super().arrays(), *self._arrays.values()]
 
-    def launch(self, name: str, inputs: list, outputs: list, **options: Any) -> None:
+    def launch(self, name: str, inputs: list, outputs: list, **options: Any) -> wp.Launch | None:
         """As for other blocks; stiffness and its product lack the coupling of the cells of a patch."""
         if name != "step_limit":
             u = inputs[1] if name == "frequency" else inputs[0]
             self.update_pressure(u, taped=name == "taped_force")
-        super().launch(name, inputs, outputs, **options)
+        launch = super().launch(name, inputs, outputs, **options)
         if name == "energy":
             self._launch_own("energy", self.patch_count, [], outputs)
         elif name == "density":
             self._launch_own("density", self.count, [], outputs)
+        return launch
 
     def update_pressure(self, u: wp.array, taped: bool = False) -> None:
         """Brings the pressures of the patches up to date with the displacements ``u``."""
@@ -129,7 +130,8 @@ class AveragedBlock(CellBlock):
     # --- the coupling sum_g r_g r_g^T / L_g -------------------------------------------------------------
 
     def linearize(self, u: wp.array) -> None:
-        """Takes the coupling at ``u``."""
+        """Takes the coupling at ``u``, and brings the pressures up to date for the stiffness there."""
+        self.update_pressure(u)
         if "rows" not in self._arrays:
             vector = self.kernels.types.vector
             self._arrays["rows"] = wp.empty(len(self._arrays["points"]), dtype=vector, device=self.device)

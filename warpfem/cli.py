@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         "--threads",
         type=_positive,
         metavar="N",
-        help="threads that explicit steps may use on the CPU (default: all cores); the result is the same",
+        help="threads that steps may use on the CPU (default: all cores); the result is the same",
     )
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     run.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else")

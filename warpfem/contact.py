@@ -19,6 +19,7 @@ import warp as wp
 
 from warpfem.boundary import BoxWalls, Obstacle, Plane, Sphere
 from warpfem.dtypes import types
+from warpfem.launches import Launcher
 from warpfem.mesh import Mesh
 from warpfem.scene import Body
 
@@ -303,6 +304,7 @@ class _ObstacleContact:
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
         self.host_stiffness = pressure_rate * surface.areas  # N/m
         self.stiffness = wp.array(self.host_stiffness, dtype=t.scalar, device=self.device)
+        self._launch = Launcher(self.device)
         self.normal_arguments = [self.points, self.origin, self.stiffness, *self.shape]
         if self.friction > 0.0:
             self.magnitude = wp.zeros(self.count, dtype=t.scalar, device=self.device)
@@ -324,7 +326,7 @@ class _ObstacleContact:
         return [*own, self.magnitude, self.normal] if self.friction > 0.0 else own
 
     def launch(self, name: str, inputs: list, outputs: list) -> None:
-        wp.launch(getattr(self.kernels, name), self.count, inputs=inputs, outputs=outputs, device=self.device)
+        self._launch(getattr(self.kernels, name), self.count, inputs, outputs)
 
 
 def _bearing_areas(mesh: Mesh) -> np.ndarray:

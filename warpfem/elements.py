@@ -265,7 +265,7 @@ class ElementKernels:
 
     def _exact_stiffness_kernel(self) -> wp.Kernel:
         return exact_stiffness_kernel(
-            self.shape, self.types, self.parameter_vector, self._kinematics, self.constitutive.stress_differential
+            self.shape, self.types, self.parameter_vector, self._kinematics, self.constitutive
         )
 
     def _filtered_stiffness_kernel(self, kind: Filter) -> wp.Kernel:

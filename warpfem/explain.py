@@ -108,7 +108,7 @@ def explain(scene: Scene, *, device: str | None = None, dtype: FloatName = "floa
         stability = "no stability limit" if limit is None else f"stable below {limit:.4g} s at rest"
         dt = f"dt = {simulation.dt:.4g} s, {simulation.steps_per_frame} steps per frame, {stability}"
     linear = [f"linear systems: {stepper.linear_solver}"] if stepper.linear_solver else []
-    forces = [f"forces: {stepper.forces}"] if stepper.forces else []
+    forces = [f"forces: {stepper.forces}"]
     bodies = f"{len(scene.bodies)} bodies" if len(scene.bodies) > 1 else "1 body"
     return Explanation(
         headline=(

@@ -16,13 +16,15 @@ from warpfem.boundary import PointForce, Traction
 from warpfem.dtypes import FloatName, types, uniform_array
 from warpfem.elements import ElementKernels, element_kernels
 from warpfem.errors import SceneError, SimulationError
+from warpfem.launches import Launcher, Total
 from warpfem.materials import Constitutive, HookeanMaterial
 from warpfem.mesh import Mesh
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
 from warpfem.stiffness import all_blocks, pair_count
-from warpfem.threads import available_threads
+from warpfem.strips import STRIP
+from warpfem.threads import CELLS_PER_THREAD, Team, available_threads
 
 if TYPE_CHECKING:
     from warpfem.contact import Contact
@@ -30,10 +32,6 @@ if TYPE_CHECKING:
     from warpfem.vectorized import VectorizedForce
 
 Route = Literal["tape", "closed", "assembled"]
-
-VECTORIZED_CELLS = 1024
-"""Cells of a material from which on explicit steps compute its forces several cells at a time: that takes some seconds
-to compile once, and work to prepare."""
 
 STIFFNESS_PART = 16384
 """Cells whose dense stiffness is held at a time: 19 MB for tetrahedra, where that of a million takes 1.2 GB."""
@@ -178,6 +176,7 @@ class CellBlock:
         self.kernels = self.bounding_kernels = kernels
         self.shape = kernels.shape
         self.device = device
+        self._launch = Launcher(device)
         self.vectorized: VectorizedForce | None = None
         self.count = sum(mesh.cell_count for mesh in meshes)
         self.index = np.concatenate([start + np.arange(b.mesh.cell_count) for b, _, start in parts])
@@ -209,13 +208,13 @@ class CellBlock:
         own = [] if self.vectorized is None else self.vectorized.arrays()
         return [*self.arguments.values(), *own]
 
-    def vectorize(self, rest_points: np.ndarray) -> None:
-        """Prepares the force of several cells at a time, where that is possible and pays."""
+    def vectorize(self, rest_points: np.ndarray, least: int, team: Team) -> None:
+        """Prepares the force of several cells at a time, where that is possible and there are ``least`` cells."""
         constitutive = self.kernels.constitutive
         # a GPU has lanes of its own, and adds to points by atomics, which it does well
         possible = self.device.is_cpu and self.shape.order == 1 and not self.averaged
         possible = possible and (constitutive.branchless or constitutive.direct_stress is not None)
-        if self.vectorized or not possible or self.count < VECTORIZED_CELLS:
+        if self.vectorized or not possible or self.count < least:
             return
         from warpfem.vectorized import VectorizedForce
 
@@ -227,6 +226,7 @@ class CellBlock:
             self.arguments["inverse_shape"].numpy(),
             self.arguments["volume"].numpy(),
             parameters.numpy()[: 1 if parameters.strides[0] == 0 else None],
+            team,
         )
 
     def add_force(self, u: wp.array, force_out: wp.array) -> None:
@@ -244,17 +244,24 @@ class CellBlock:
         *,
         part: slice | None = None,
         kernels: ElementKernels | None = None,
-    ) -> None:
+        record: bool = False,
+    ) -> wp.Launch | None:
         """Launches the kernel of that name over the quadrature points of the cells, or of a part of them.
 
-        Of :attr:`arguments` it gets first those that it names. Those of frequency and stiffness run over cells.
+        Of :attr:`arguments` it gets first those that it names. Those of frequency and stiffness run over cells. With
+        ``record`` it returns the launch instead.
         """
         kernel = getattr(kernels or self.kernels, name)
         arrays = self.arguments if part is None else self._arguments_of(part)
         own = [arrays[argument.label] for argument in kernel.adj.args if argument.label in arrays]
         by_cell = name == "frequency" or name.endswith("stiffness")
         tasks = len(arrays["cells"]) if by_cell else len(arrays["volume"])
-        wp.launch(kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device)
+        if record or name.startswith("taped"):
+            return wp.launch(
+                kernel, tasks, inputs=[*own, *inputs], outputs=outputs, device=self.device, record_cmd=record
+            )
+        self._launch(kernel, tasks, [*own, *inputs], outputs)
+        return None
 
     def _arguments_of(self, part: slice) -> dict[str, wp.array]:
         places = self.shape.quadrature_count
@@ -280,7 +287,7 @@ class Model:
         scene: the scene.
         device: Warp device.
         dtype: "float32" or "float64".
-        threads: threads of the CPU that explicit steps may use; the results do not depend on them.
+        threads: threads of the CPU that steps may use; the results do not depend on them.
         types: the Warp types.
         point_count, cell_count: totals over the bodies.
         point_starts, cell_starts: first point and cell of each body, with the total at the end.
@@ -324,7 +331,8 @@ class Model:
         self.dead_load = None if load is None else self._device_array(load, self.types.vector)
         self.supports = self._supports()
         self.contact = self._contact()
-        self._sum = wp.zeros(1, dtype=wp.float64, device=self.device)
+        self._sum = Total(self.device)
+        self._launch = Launcher(self.device)
 
     # --- finalising -------------------------------------------------------------------------------------
 
@@ -414,6 +422,11 @@ class Model:
         return wp.zeros(self.point_count, dtype=self.types.vector, device=self.device)
 
     @cached_property
+    def team(self) -> Team:
+        """The threads that steps use, as many as the cells are worth."""
+        return Team(max(1, min(self.threads, self.cell_count // CELLS_PER_THREAD)) if self.device.is_cpu else 1)
+
+    @cached_property
     def static_load(self) -> wp.array | None:
         """Gravity and constant loads [N] for states of rest, device array, or ``None``: gravity by shape functions.
 
@@ -443,17 +456,17 @@ class Model:
 
     def dot(self, a: wp.array, b: wp.array) -> float:
         """a . b over all points, summed in float64."""
-        self._sum.zero_()
+        self._sum.clear()
         kernel = point_kernels(self.dim, self.dtype).dot
-        wp.launch(kernel, chunks(a.shape[0]), inputs=[a, b], outputs=[self._sum], device=self.device)
-        return float(self._sum.numpy()[0])
+        self._launch(kernel, chunks(a.shape[0]), [a, b], [self._sum.array])
+        return self._sum.read()
 
     def elastic_energy(self, u: wp.array) -> float:
         """U(u) [J], summed in float64."""
-        self._sum.zero_()
+        self._sum.clear()
         for block in self.blocks:
-            block.launch("energy", [u], [self._sum])
-        return float(self._sum.numpy()[0])
+            block.launch("energy", [u], [self._sum.array])
+        return self._sum.read()
 
     def energy_densities(self, state: State) -> np.ndarray:
         """The energy density psi of every cell, its mean if quadratic, (cell_count,) float64 [J/m^3], 0 at rest.
@@ -473,22 +486,22 @@ class Model:
         """Penalty energy of the obstacles [J]."""
         if self.contact is None:
             return 0.0
-        self._sum.zero_()
-        self.contact.add_energy(u, self._sum)
-        return float(self._sum.numpy()[0])
+        self._sum.clear()
+        self.contact.add_energy(u, self._sum.array)
+        return self._sum.read()
 
     def energies(self, state: State) -> Energies:
         """All energies of a state [J]."""
-        self._sum.zero_()
+        self._sum.clear()
         kernel = point_kernels(self.dim, self.dtype).kinetic_energy
         wp.launch(
             kernel,
             chunks(self.point_count),
             inputs=[self.mass, state.v],
-            outputs=[self._sum],
+            outputs=[self._sum.array],
             device=self.device,
         )
-        kinetic = float(self._sum.numpy()[0])
+        kinetic = self._sum.read()
         load = 0.0 if self.dead_load is None else 0.0 - self.dot(self.dead_load, state.u)
         return Energies(kinetic, self.elastic_energy(state.u), load, self.contact_energy(state.u))
 
@@ -511,10 +524,23 @@ class Model:
         if self.contact is not None:
             self.contact.add_force(u, force_out)
 
-    def vectorize(self) -> None:
-        """Prepares the forces of explicit steps: on the CPU, of several cells at a time."""
+    def vectorize(self, least: int) -> None:
+        """Prepares the forces of steps on the CPU: of several cells at a time, where a material has ``least`` of them.
+
+        Fewer are not worth the seconds that the compiler takes the first time.
+        """
         for block in self.blocks:
-            block.vectorize(self.rest_points)
+            block.vectorize(self.rest_points, least, self.team)
+
+    def describe_forces(self) -> str:
+        """How :meth:`add_internal_force` computes them, and on how many threads."""
+        count = sum(block.count for block in self.blocks if block.vectorized)
+        if not count:
+            return "one cell at a time, on one thread"
+        plain = self.cell_count - count
+        others = f", {plain} others one at a time" if plain else ""
+        threads = "1 thread" if self.team.size == 1 else f"{self.team.size} threads"
+        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""

@@ -37,7 +37,14 @@ def local_constitutive(constitutive: Constitutive) -> Constitutive:
         return own + parameters[_PRESSURE] * measure.gradient_differential(H, dH)
 
     # convex materials are those with a linear measure, whose differential is zero
-    return replace(material, stress=stress, stress_differential=stress_differential, parameter_count=4, volumetric=None)
+    return replace(
+        material,
+        stress=stress,
+        stress_differential=stress_differential,
+        rotated_differential=None,
+        parameter_count=4,
+        volumetric=None,
+    )
 
 
 @functools.cache

@@ -123,7 +123,7 @@ def run(
         dtype: "float32" or "float64".
         checkpoint_every: frames between two checkpoints; ``None`` writes none.
         resume: go on after the checkpoint of an earlier run, which differs in the number of frames at most.
-        threads: threads of the CPU that explicit steps may use; ``None`` takes all cores. Results are the same.
+        threads: threads of the CPU that steps may use; ``None`` takes all cores. Results are the same.
 
     Returns:
         What the run did, with what came before the checkpoint.

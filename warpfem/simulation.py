@@ -148,7 +148,7 @@ class Simulation:
         device: Warp device, for example "cpu" or "cuda:0"; ``None`` takes Warp's default.
         dtype: "float32" or "float64".
         solver: takes the place of the scene's.
-        threads: threads of the CPU that explicit steps may use; ``None`` takes all cores. Results are the same.
+        threads: threads of the CPU that steps may use; ``None`` takes all cores. Results are the same.
 
     Attributes:
         scene: the scene.

@@ -10,7 +10,9 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import Types
+from warpfem.materials.base import Constitutive
 from warpfem.shapes import Shape
+from warpfem.tensor import deformation_gradient, polar_rotation
 
 
 def pair_count(point_count: int) -> int:
@@ -49,7 +51,7 @@ def exact_stiffness_kernel(
     types: Types,
     parameter_vector: type,
     kinematics: tuple[wp.Function, wp.Function],
-    stress_differential: wp.Function,
+    constitutive: Constitutive,
 ) -> wp.Kernel:
     """Of the material's own stress differential.
 
@@ -58,7 +60,7 @@ def exact_stiffness_kernel(
         types: the Warp types.
         parameter_vector: type of the material's parameters.
         kinematics: the functions ``shape_gradients`` and ``displacement_gradient`` of ``ElementKernels``.
-        stress_differential: dP of H, dH and the parameters.
+        constitutive: the material.
     """
     dim, points, places = shape.dim, shape.point_count, shape.quadrature_count
     scalar, vector, matrix = types.scalar, types.vector, types.matrix
@@ -66,6 +68,8 @@ def exact_stiffness_kernel(
     shape_gradients, displacement_gradient = kinematics
     others, pairs = points - 1, pair_count(points)
     differentials_type = wp.types.matrix(shape=(dim * dim, dim), dtype=scalar)
+    stress_differential, rotated_differential = constitutive.stress_differential, constitutive.rotated_differential
+    rotated = rotated_differential is not None
 
     @wp.func
     def block_of(rows: differentials_type, g: vector):
@@ -93,6 +97,8 @@ def exact_stiffness_kernel(
             i = c * places + place
             gradients = shape_gradients(inverse_shape[i], place)
             H = displacement_gradient(u, cells[c], gradients)
+            if wp.static(rotated):
+                R = polar_rotation(deformation_gradient(H))
             corner = matrix()
             for b in range(count):  # the columns of shape function b + 1
                 # row (k, m) is the change of row m of the weighted stress by a displacement along axis k
@@ -100,7 +106,11 @@ def exact_stiffness_kernel(
                 for k in range(dim):
                     axis = vector()
                     axis[k] = scalar(1.0)
-                    dP = volume[i] * stress_differential(H, wp.outer(axis, gradients[b]), parameters[c])
+                    dH = wp.outer(axis, gradients[b])
+                    if wp.static(rotated):
+                        dP = volume[i] * rotated_differential(H, R, dH, parameters[c])
+                    else:
+                        dP = volume[i] * stress_differential(H, dH, parameters[c])
                     for m in range(dim):
                         rows[k * dim + m] = dP[m]
                 column = matrix()

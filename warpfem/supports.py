@@ -11,6 +11,7 @@ import warp as wp
 from warpfem.boundary import Pin, PrescribedMotion, Support
 from warpfem.dtypes import types
 from warpfem.errors import SceneError, source_of, user_code
+from warpfem.launches import Launcher
 from warpfem.scene import Body
 
 
@@ -94,6 +95,7 @@ class Supports:
         self.types = types(dim, dtype)
         self.kernels = support_kernels(dim, dtype)
         self.device = device
+        self._launch = Launcher(device)
         claims: dict[tuple[int, int], Support] = {}
         motions = []
         for body, start in zip(bodies, starts, strict=True):
@@ -202,7 +204,8 @@ class Supports:
 
     def hold(self, u: wp.array, v: wp.array) -> None:
         """Puts the held components of ``u`` and ``v`` at their targets."""
-        self.record_hold(u, v).launch()
+        inputs = [self.points, self.held, self.target, self.target_rate]
+        self._launch(self.kernels.hold, self.count, inputs, [u, v])
 
     def record_hold(self, u: wp.array, v: wp.array) -> wp.Launch:
         """The launch of :meth:`hold`."""
@@ -217,10 +220,4 @@ class Supports:
 
     def project(self, vector: wp.array) -> None:
         """Sets the held components of ``vector`` to zero."""
-        wp.launch(
-            self.kernels.project,
-            self.count,
-            inputs=[self.points, self.held],
-            outputs=[vector],
-            device=self.device,
-        )
+        self._launch(self.kernels.project, self.count, [self.points, self.held], [vector])

@@ -496,9 +496,8 @@ def _rotation_rate(R: mat33, F: mat33, G: mat33):
 
 
 @wp.func
-def rotation_differential(F: mat22, G: mat22):
-    """dR for the change G of F."""
-    R = polar_rotation(F)
+def rotation_change(R: mat22, F: mat22, G: mat22):
+    """dR for the change G of F, whose rotation is R."""
     T = wp.transpose(R) * G
     stretch = wp.length(wp.vector(F[0, 0] + F[1, 1], F[1, 0] - F[0, 1]))
     floor = _least_stretch_sum(stretch) * wp.sqrt(wp.ddot(F, F)) + F.dtype(1.0e-30)
@@ -508,10 +507,15 @@ def rotation_differential(F: mat22, G: mat22):
 
 
 @wp.func
-def rotation_differential(F: mat33, G: mat33):  # noqa: F811
-    """dR for the change G of F, guarded where two singular values sum to zero."""
-    R = polar_rotation(F)
+def rotation_change(R: mat33, F: mat33, G: mat33):  # noqa: F811
+    """dR for the change G of F, whose rotation is R, guarded where two singular values sum to zero."""
     return R * skew(_rotation_rate(R, F, G))
+
+
+@wp.func
+def rotation_differential(F: Any, G: Any):
+    """dR for the change G of F."""
+    return rotation_change(polar_rotation(F), F, G)
 
 
 @functools.cache

@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from queue import SimpleQueue
 
+CELLS_PER_THREAD = 8192
+"""Cells for which a thread is worth while: handing over work costs as much as the forces of some thousand."""
+
 Job = Callable[[], None]
 
 Outcomes = list[BaseException | None]

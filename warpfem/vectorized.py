@@ -19,9 +19,11 @@ import warp as wp
 
 from warpfem.dtypes import types
 from warpfem.elements import ElementKernels
+from warpfem.launches import Recordings, jobs
 from warpfem.materials.base import Constitutive
 from warpfem.strips import STRIP, cut_into_strips
 from warpfem.tensor import select
+from warpfem.threads import Job, Team, share
 
 CHUNK = 64
 """Strips of one task: their forces (4.6 kB in single precision) fit the first-level cache with all else."""
@@ -245,6 +247,7 @@ class VectorizedForce:
         inverse_shape: D_m^-1 of each cell, (count, dim, dim) [1/m].
         volumes: (count,) [m^3].
         parameters: the material's, (1, k) if uniform, else (count, k).
+        team: the threads among which :meth:`add` divides its work.
 
     Attributes:
         known: for a material with a direct stress, 1 for each cell of the strips where it held in the last forces
@@ -259,7 +262,10 @@ class VectorizedForce:
         inverse_shape: np.ndarray,
         volumes: np.ndarray,
         parameters: np.ndarray,
+        team: Team,
     ) -> None:
+        self._team = team
+        self._recordings = Recordings()
         t = kernels.types
         dim = self.dim = kernels.dim
         dtype = "float32" if t.scalar is wp.float32 else "float64"
@@ -373,6 +379,12 @@ class VectorizedForce:
 
     def add(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the internal forces at ``u`` to ``force_out``."""
-        for launch in self.record_forces(u, range(self.chunk_count)):
-            launch.launch()
-        self.record_sums(force_out, range(len(force_out))).launch()
+        key = (u.ptr, force_out.ptr)
+        for part in self._recordings.get(key, lambda: self._record(u, force_out)):
+            self._team.run(part)
+
+    def _record(self, u: wp.array, force_out: wp.array) -> tuple[list[Job], list[Job]]:
+        size = self._team.size
+        forces = [self.record_forces(u, part) for part in share(self.chunk_count, size)]
+        sums = [[self.record_sums(force_out, part)] for part in share(len(force_out), size, WINDOW)]
+        return jobs(forces), jobs(sums)

@@ -349,7 +349,7 @@ def _scaling(result: Results, folder: Path) -> list[str]:
         points = [(row["cells"], row["median"]) for row in explicit if row["threads"] == threads]
         axes.plot(*zip(*points, strict=True), "o-", label=f"explicit, threads: {threads}")
     _save(figure, axes, folder / "cells.png")
-    lines += [f"![time per step against cells]({folder.name}/cells.png)", "", "### Static solves", ""]
+    lines += [f"![time per step against cells]({folder.name}/cells.png)", "", "### Static solves with multigrid", ""]
     static = [row for row in result["static"] if not row["missing"]]
     rows = [[f"{row['unknowns']:,}", row["newton"], row["iterations"], _time(row["median"])] for row in static]
     lines += _table(["unknowns", "Newton iterations", "CG iterations", "time"], rows)
@@ -358,6 +358,10 @@ def _scaling(result: Results, folder: Path) -> list[str]:
         [row["unknowns"] for row in static], [row["iterations"] / row["newton"] for row in static], "o-", label="static"
     )
     _save(figure, axes, folder / "iterations.png")
+    counts = [row["iterations"] / row["newton"] for row in static]
+    if counts:
+        growth = max(counts) / counts[0]
+        lines += [_target("iterations grow by, aimed at less than 2", growth, growth < 2.0) + ".", ""]
     return [*lines, f"![iterations against unknowns]({folder.name}/iterations.png)", ""]
 
 

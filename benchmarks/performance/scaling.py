@@ -15,7 +15,7 @@ BEAMS = ((32, 8, 8), (56, 14, 14), (100, 25, 25), (172, 43, 43))
 
 
 def run(quick: bool, peers_folder: Path, threads: tuple[int, ...]) -> dict[str, Any]:
-    """Measures explicit steps on growing meshes, and the iterations of static solves."""
+    """Measures explicit steps on growing meshes, and the iterations of multigrid in static solves."""
     counts = sorted({*threads, os.cpu_count() or 1})
     explicit = []
     for side in SIDES[:2] if quick else SIDES:
@@ -31,6 +31,7 @@ def run(quick: bool, peers_folder: Path, threads: tuple[int, ...]) -> dict[str, 
     for beam in ((8, 2, 2), (16, 4, 4)) if quick else BEAMS:
         problem = problems.cantilever(beam, (4.0, 1.0, 1.0), E=2e6, nu=0.3)
         options = {"material": "linear", "dtype": "float64", "tolerance": 1e-6, "threads": max(counts)}
+        options["linear_solver"] = "multigrid"
         (outcome,) = take_turns(
             [Contender("warpfem", "warpfem_static.py", "warpfem", options)], problem, 1, peers_folder
         )

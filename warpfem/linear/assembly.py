@@ -11,8 +11,10 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
+from warpfem.launches import Recordings, jobs
 from warpfem.model import Model
 from warpfem.stiffness import pair_count
+from warpfem.threads import Job, share
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class Assembly:
         ends = np.cumsum(counts).tolist()
         self._parts = [self._entries[end - count : end] for end, count in zip(ends, counts, strict=True)]
         self._free = free
+        self._recordings = Recordings()
 
     def _new_blocks(self, count: int) -> wp.array:
         return wp.empty(count, dtype=self.model.types.matrix, device=self.model.device)
@@ -115,19 +118,35 @@ class Assembly:
             mass_weight: what the mass is multiplied by [1/s^2].
             extra: blocks to add on the diagonal, one per point; empty: none.
         """
-        model = self.model
+        key = (kernel, u.ptr, mass_weight, extra.ptr)
+        for part in self._recordings.get(key, lambda: self._record(kernel, u, mass_weight, extra)):
+            self.model.team.run(part)
+
+    def _record(self, kernel: str, u: wp.array, mass_weight: float, extra: wp.array) -> tuple[list[Job], list[Job]]:
+        """The launches of the cells' entries, then those that sum them up, divided among threads."""
+        model, size = self.model, self.model.team.size
+        cells: list[list[wp.Launch | None]] = [[] for _ in range(size)]
         for block, entries in zip(model.blocks, self._parts, strict=True):
-            block.launch(kernel, [u], [entries])
-        wp.launch(
-            _assemble_kernel(model.dim, model.dtype),
-            model.point_count,
-            inputs=[
-                *(self.row_starts, self.columns, self.diagonal, *self._sums),
-                *(self._entries, model.mass, mass_weight, extra, self._free),
-            ],
-            outputs=[self.blocks],
-            device=model.device,
-        )
+            pairs = pair_count(block.shape.point_count)
+            for launches, part in zip(cells, share(block.count, size), strict=True):
+                out = entries[part.start * pairs : part.stop * pairs]
+                launches.append(block.launch(kernel, [u], [out], part=slice(part.start, part.stop), record=True))
+        inputs = [
+            *(self.row_starts, self.columns, self.diagonal, *self._sums),
+            *(self._entries, model.mass, mass_weight, extra, self._free),
+        ]
+        rows = [
+            wp.launch(
+                _assemble_kernel(model.dim, model.dtype),
+                len(part),
+                inputs=[part.start, *inputs],
+                outputs=[self.blocks],
+                device=model.device,
+                record_cmd=True,
+            )
+            for part in share(model.point_count, size)
+        ]
+        return jobs(cells), jobs([[row] for row in rows])
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
@@ -141,6 +160,7 @@ def _assemble_kernel(dim: int, dtype: str) -> wp.Kernel:
 
     @wp.kernel(module=f"warpfem.assembly_{dim}_{dtype}", enable_backward=False)
     def assemble(
+        first: int,
         row_starts: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         diagonal: wp.array(dtype=wp.int32),
@@ -156,7 +176,7 @@ def _assemble_kernel(dim: int, dtype: str) -> wp.Kernel:
         blocks_out: wp.array(dtype=matrix),
     ):
         """Sums entries, mass and the extra blocks on the diagonal; held rows and columns become those of I."""
-        i = wp.tid()
+        i = first + wp.tid()
         number = upper_starts[i]
         for slot in range(diagonal[i], row_starts[i + 1]):
             total = matrix()

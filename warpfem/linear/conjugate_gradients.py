@@ -4,12 +4,14 @@ import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
+from warpfem.launches import Launcher
 from warpfem.linear.operators import TangentOperator
 from warpfem.model import Model
 from warpfem.points import CHUNK, chunks
@@ -83,10 +85,11 @@ class BlockJacobi(Preconditioner):
     def __init__(self, operator: TangentOperator) -> None:
         self._operator = operator
         self._kernel = _kernels(operator.model.dim, operator.model.dtype).multiply_blocks
+        self._launch = Launcher(operator.model.device)
 
     def apply(self, r: wp.array, z_out: wp.array) -> None:
         inputs = [self._operator.inverse_diagonal, r]
-        wp.launch(self._kernel, r.shape[0], inputs=inputs, outputs=[z_out], device=r.device)
+        self._launch(self._kernel, r.shape[0], inputs, [z_out])
 
 
 class ConjugateGradients:
@@ -107,6 +110,7 @@ class ConjugateGradients:
         self._scalars = wp.zeros(5, dtype=wp.float64, device=model.device)
         self._view = self._scalars.numpy() if model.device.is_cpu else None
         self._graph: tuple | None = None
+        self._launcher = Launcher(model.device)
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
@@ -206,8 +210,12 @@ class ConjugateGradients:
         return max_iterations, LinearStatus.ITERATIONS
 
     def _launch_iteration(self, operator: TangentOperator, preconditioner: Preconditioner, x: wp.array) -> None:
+        operator.apply(self._p, self._q)
+        self._launch_update(preconditioner, x)
+
+    def _launch_update(self, preconditioner: Preconditioner, x: wp.array) -> None:
+        """What follows the product q = A p."""
         r, z, p, q, scalars = self._r, self._z, self._p, self._q, self._scalars
-        operator.apply(p, q)
         self._launch_chunks("curvature", [p, q], [self._parts])
         self._launch_once("choose_step", [self._parts], [scalars])
         self._launch("advance", [p, q, scalars], [x, r])
@@ -224,9 +232,12 @@ class ConjugateGradients:
         parties = operator, preconditioner, x  # held by the graph, so that no other gets their ids
         key = (*map(id, parties), preconditioner.version)
         if self._graph is None or self._graph[0] != key:
+            launch = self._launch_update if operator.divided else partial(self._launch_iteration, operator)
             with wp.ScopedCapture(device=self.model.device) as capture:
-                self._launch_iteration(operator, preconditioner, x)
+                launch(preconditioner, x)
             self._graph = key, parties, capture.graph
+        if operator.divided:
+            operator.apply(self._p, self._q)
         wp.capture_launch(self._graph[2])
 
     def _scalar(self, index: int) -> float:
@@ -243,7 +254,7 @@ class ConjugateGradients:
         self._launch_tasks(name, 1, inputs, outputs)
 
     def _launch_tasks(self, name: str, tasks: int, inputs: list, outputs: list) -> None:
-        wp.launch(getattr(self._kernels, name), tasks, inputs=inputs, outputs=outputs, device=self.model.device)
+        self._launcher(getattr(self._kernels, name), tasks, inputs, outputs)
 
 
 @functools.cache

@@ -15,9 +15,11 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.elements import Filter
 from warpfem.errors import SimulationError
+from warpfem.launches import Launcher, Recordings, jobs
 from warpfem.linear.assembly import Assembly
 from warpfem.model import CellBlock, Model, Route
 from warpfem.tensor import is_positive_definite
+from warpfem.threads import Job, share
 
 Hessian: TypeAlias = Literal["exact", Filter]
 
@@ -74,18 +76,20 @@ def operator_kernels(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def multiply(
+        first: int,
         row_starts: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         blocks: wp.array(dtype=matrix),
         p: wp.array(dtype=vector),
         product_out: wp.array(dtype=vector),
     ):
-        """Writes the product of a block-sparse matrix with p."""
-        i = wp.tid()
+        """Writes the product of rows of a block-sparse matrix with p, from the first on."""
+        i = first + wp.tid()
         product_out[i] = add_row_product(row_starts, columns, blocks, p, i, vector())
 
     @wp.kernel(module=module, enable_backward=False)
     def subtract_product(
+        first: int,
         row_starts: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         blocks: wp.array(dtype=matrix),
@@ -94,7 +98,7 @@ def operator_kernels(dim: int, dtype: str) -> SimpleNamespace:
         difference_out: wp.array(dtype=vector),
     ):
         """Writes b less the product with p, summed in float64: where they nearly cancel, float32 leaves noise."""
-        i = wp.tid()
+        i = first + wp.tid()
         total = double()
         for k in range(dim):
             total[k] = wp.float64(b[i][k])
@@ -153,17 +157,20 @@ class TangentOperator(ABC):
         inverse_diagonal: inverse of each point's diagonal block: the block Jacobi preconditioner. Valid
             after ``linearize(..., precondition=True)``.
         fixed: whether :meth:`apply` launches the same kernels with the same arrays whatever the tangent.
+        divided: whether it divides them among threads, which no graph can hold.
         revision: counts the tangents taken.
         free: 1 for free and 0 for held components of each point, empty without supports.
         contact_blocks: what contact adds to the diagonal block of each point, empty without contact.
     """
 
     fixed = False
+    divided = False
 
     def __init__(self, model: Model, external: bool) -> None:
         self.model = model
         self.kernels = operator_kernels(model.dim, model.dtype)
         self.hessian: Hessian = "exact"
+        self._launcher = Launcher(model.device)
         self.supports = model.supports if external else None
         self.contact = model.contact if external else None
         self.averaged = [block for block in model.blocks if block.averaged]
@@ -218,7 +225,7 @@ class TangentOperator(ABC):
         return wp.zeros(count, dtype=self.model.types.matrix, device=self.model.device)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, self.model.point_count, inputs=inputs, outputs=outputs, device=self.model.device)
+        self._launcher(kernel, self.model.point_count, inputs, outputs)
 
     def _linearize_couplings(self, u: wp.array, friction: tuple[wp.array, float] | None) -> None:
         """Those of averaged cells, and contact."""
@@ -258,6 +265,8 @@ class AssembledOperator(TangentOperator):
     def __init__(self, model: Model, external: bool) -> None:
         super().__init__(model, external)
         self.assembly = Assembly(model, self.free)
+        self.divided = model.team.size > 1
+        self._recordings = Recordings()
 
     def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
         self.hessian = hessian
@@ -267,8 +276,7 @@ class AssembledOperator(TangentOperator):
             self._invert_diagonal(self.assembly)
 
     def apply(self, p, product_out) -> None:
-        own = self.assembly
-        self._launch(self.kernels.multiply, [own.row_starts, own.columns, own.blocks, p], [product_out])
+        self._launch_rows(self.kernels.multiply, [p], product_out)
         for block in self.averaged:
             block.add_coupling(p, product_out)
         if self.averaged and self.supports is not None:
@@ -278,9 +286,36 @@ class AssembledOperator(TangentOperator):
         if self.averaged:
             super().subtract_product(b, p, difference_out)
             return
+        self._launch_rows(self.kernels.subtract_product, [p, b], difference_out)
+
+    def _launch_rows(self, kernel: wp.Kernel, vectors: list[wp.array], out: wp.array) -> None:
+        """Launches a kernel over the rows of the matrix, divided among threads."""
         own = self.assembly
-        inputs = [own.row_starts, own.columns, own.blocks, p, b]
-        self._launch(self.kernels.subtract_product, inputs, [difference_out])
+        matrix = [own.row_starts, own.columns, own.blocks]
+        if not self.divided:
+            self._launch(kernel, [0, *matrix, *vectors], [out])
+            return
+
+        def record() -> list[Job]:
+            parts = share(self.model.point_count, self.model.team.size)
+            return jobs(
+                [
+                    [
+                        wp.launch(
+                            kernel,
+                            len(part),
+                            inputs=[part.start, *matrix, *vectors],
+                            outputs=[out],
+                            device=self.model.device,
+                            record_cmd=True,
+                        )
+                    ]
+                    for part in parts
+                ]
+            )
+
+        key = (kernel, out.ptr, *(vector.ptr for vector in vectors))
+        self.model.team.run(self._recordings.get(key, record))
 
     def arrays(self) -> list[wp.array]:
         return [*super().arrays(), *self.assembly.arrays()]

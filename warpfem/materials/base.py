@@ -34,6 +34,8 @@ class Constitutive:
             gradients silently do not flow.
         branchless: whether ``stress`` has neither branches nor calls of library functions, so that the compiler can
             work on several cells at once.
+        rotated_differential: ``(H, R, dH, parameters) -> dP``, ``stress_differential`` with the rotation R of F at
+            hand, which is then computed once for many dH. ``None`` where P holds no rotation.
         direct_stress: ``(H, parameters) -> (P, holds)``, a form without branches of a ``stress`` that has some;
             ``holds`` is 1 where P is the stress, 0 where only ``stress`` knows it. ``None`` if there is no such form.
         volumetric: the measure theta if the energy is psi(F; mu, 0) + lam/2 theta^2, which averaged cells need; else
@@ -51,6 +53,7 @@ class Constitutive:
     barrier: bool = False
     differentiable: bool = True
     branchless: bool = False
+    rotated_differential: Any = None
     direct_stress: Any = None
     volumetric: VolumetricMeasure | None = None
 

@@ -15,7 +15,8 @@ from warpfem.tensor import (
     differentiable_rotation,
     direct_rotation,
     identity_like,
-    rotation_differential,
+    polar_rotation,
+    rotation_change,
     select,
     symmetric_part,
     volume_change,
@@ -57,20 +58,25 @@ def _constitutive() -> Constitutive:
         return rotated_stress(H, R, parameters), holds
 
     @wp.func
-    def stress_differential(H: Any, dH: Any, parameters: Any):
+    def rotated_differential(H: Any, R: Any, dH: Any, parameters: Any):
         F = deformation_gradient(H)
         C = cofactor(F)
         return (
-            (H.dtype(2.0) * parameters[0]) * (dH - rotation_differential(F, dH))
+            (H.dtype(2.0) * parameters[0]) * (dH - rotation_change(R, F, dH))
             + (parameters[1] * wp.ddot(C, dH)) * C
             + (parameters[1] * volume_change(H)) * cofactor_differential(F, dH)
         )
+
+    @wp.func
+    def stress_differential(H: Any, dH: Any, parameters: Any):
+        return rotated_differential(H, polar_rotation(deformation_gradient(H)), dH, parameters)
 
     return Constitutive(
         energy_density,
         stress,
         stress_differential,
         corotated=True,
+        rotated_differential=rotated_differential,
         direct_stress=direct_stress,
         volumetric=VOLUME_CHANGE,
     )

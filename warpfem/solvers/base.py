@@ -64,7 +64,6 @@ class Stepper(ABC):
             refused, since the next one will be shorter.
         controls_error: whether dt shall follow the errors that :meth:`try_step` estimates.
         linear_solver: what solves the linear systems of a step, and why; empty where there are none.
-        forces: how an explicit step computes the internal forces, and on how many threads; empty for others.
     """
 
     model: Model
@@ -72,7 +71,11 @@ class Stepper(ABC):
     adaptive: bool = False
     controls_error: bool = False
     linear_solver: str = ""
-    forces: str = ""
+
+    @property
+    def forces(self) -> str:
+        """How a step computes the internal forces, and on how many threads."""
+        return self.model.describe_forces()
 
     @abstractmethod
     def step(self, state: State, dt: float) -> StepReport:

@@ -4,40 +4,36 @@ import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
 from warpfem.errors import SimulationError, TimeStepError
+from warpfem.launches import Recordings, jobs
 from warpfem.model import Model, State
 from warpfem.points import CHUNK
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, worst_cell
 from warpfem.solvers.stability import Watch, largest_frequency
-from warpfem.strips import STRIP
 from warpfem.subnormals import SubnormalsFlushed
-from warpfem.threads import Job, Team, share
+from warpfem.threads import Job, share
 from warpfem.vectorized import WINDOW
 
 TRACKING_INTERVALS = (16, 1024)
 """Bounds of the steps after which the stability limit is estimated again, at the cost of some twenty steps: the fewer
 cells, the sooner a wave has crossed them, and the less it matters."""
 
-CELLS_PER_THREAD = 8192
-"""Cells for which a thread is worth while: handing over work costs as much as the forces of some thousand."""
-
-MOST_RECORDED = 8
-"""Recordings kept: with a fixed dt there are two or three. Launching one takes a tenth of launching anew."""
+VECTORIZED_CELLS = 1024
+"""Cells of a material from which on its forces are computed several cells at a time: that takes some seconds to compile
+once, and work to prepare."""
 
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
 
 
 KickDrift = Callable[..., wp.Launch | None]
-Recording = TypeVar("Recording")
 
 
 @functools.cache
@@ -78,21 +74,6 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
     return kick_drift
 
 
-class _Recordings:
-    """What has been recorded under some keys: the last few, since arguments like dt may change for ever."""
-
-    def __init__(self) -> None:
-        self._recorded: dict[tuple, Any] = {}
-
-    def get(self, key: tuple, record: Callable[[], Recording]) -> Recording:
-        """What ``record`` makes the first time."""
-        if key not in self._recorded:
-            if len(self._recorded) == MOST_RECORDED:
-                self._recorded.clear()
-            self._recorded[key] = record()
-        return self._recorded[key]
-
-
 class _Passes:
     """A step of vectorised bodies as two passes of recorded launches, each divided among threads.
 
@@ -103,13 +84,9 @@ class _Passes:
     def __init__(self, model: Model, force: wp.array) -> None:
         self._forces = [block.vectorized for block in model.blocks]
         self._force = force
-        self._team = Team(max(1, min(model.threads, model.cell_count // CELLS_PER_THREAD)))
+        self._team = model.team
         self._points = share(model.point_count, self._team.size, WINDOW)
-        self._recordings = _Recordings()
-
-    @property
-    def thread_count(self) -> int:
-        return self._team.size
+        self._recordings = Recordings()
 
     def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
         """Takes the step.
@@ -121,8 +98,8 @@ class _Passes:
             settings: of the move.
         """
         key = (state.u.ptr, state.v.ptr, *settings)
-        for jobs in self._recordings.get(key, lambda: self._record(kick_drift, state, *settings)):
-            self._team.run(jobs)
+        for part in self._recordings.get(key, lambda: self._record(kick_drift, state, *settings)):
+            self._team.run(part)
 
     def _record(self, kick_drift: KickDrift, state: State, *settings: float) -> tuple[list[Job], list[Job]]:
         first: list[list[wp.Launch | None]] = [[] for _ in self._points]
@@ -134,33 +111,13 @@ class _Passes:
                 launches.append(force.record_sums(self._force, points))
         for launches, points in zip(second, self._points, strict=True):
             launches.append(kick_drift(state, points, *settings))
-        return _jobs(first), _jobs(second)
-
-
-def _jobs(launches: list[list[wp.Launch | None]]) -> list[Job]:
-    """A job of launches for each thread; threads other than the calling one flush subnormal numbers by themselves.
-
-    Where a thread has no part in a body, Warp records ``None``.
-    """
-
-    def job(own: list[wp.Launch], flushed: AbstractContextManager) -> Job:
-        def launch() -> None:
-            with flushed:
-                for each in own:
-                    each.launch()
-
-        return launch
-
-    return [
-        job([each for each in own if each is not None], SubnormalsFlushed() if thread else nullcontext())
-        for thread, own in enumerate(launches)
-    ]
+        return jobs(first, SubnormalsFlushed), jobs(second, SubnormalsFlushed)
 
 
 class _ExplicitStepper(Stepper):
     def __init__(self, model: Model) -> None:
         self.model = model
-        model.vectorize()
+        model.vectorize(VECTORIZED_CELLS)
         self._kernel = _kick_drift_kernel(model.dim, model.dtype)
         self._force = model.zeros()
         self._rough = model.contact is not None and model.contact.rough
@@ -176,10 +133,9 @@ class _ExplicitStepper(Stepper):
         self._passes: _Passes | None = None
         if all(block.vectorized for block in model.blocks):
             self._passes = _Passes(model, self._force)
-        self.forces = self._describe_forces()
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
         self._inverse_mass = self._free_inverse_mass()
-        self._recordings = _Recordings()
+        self._recordings = Recordings()
 
     def step(self, state: State, dt: float) -> StepReport:
         with self._flushed:
@@ -198,16 +154,6 @@ class _ExplicitStepper(Stepper):
         held = model.supports.held.numpy().reshape(model.supports.count, -1).all(axis=1)
         inverse[model.supports.points.numpy()[held]] = 0.0
         return wp.array(inverse, dtype=model.types.scalar, device=model.device)
-
-    def _describe_forces(self) -> str:
-        count = sum(block.count for block in self.model.blocks if block.vectorized)
-        if not count:
-            return "one cell at a time, on one thread"
-        plain = self.model.cell_count - count
-        size = 1 if self._passes is None else self._passes.thread_count
-        others = f", {plain} others one at a time" if plain else ""
-        threads = "1 thread" if size == 1 else f"{size} threads"
-        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
 
     def arrays(self) -> list[wp.array]:
         own = [self._force, self._alarm, *([] if self._watch is None else self._watch.arrays())]

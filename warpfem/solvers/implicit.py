@@ -31,6 +31,10 @@ from warpfem.solvers.base import (
 from warpfem.solvers.error_control import ErrorNorm
 from warpfem.solvers.newton import Newton, NewtonSettings, require_choice
 
+VECTORIZED_CELLS = 8192
+"""Cells of a material from which on its forces are computed several cells at a time, which takes some seconds to
+compile once: the forces are a small part of an implicit step."""
+
 MAX_HALVINGS = 10
 """How often a step that fails is halved before it is refused."""
 
@@ -100,6 +104,7 @@ class ImplicitStepper(Stepper):
     def __init__(self, model: Model, config: ImplicitSolver, error: float | None = None) -> None:
         self.model = model
         self.config = config
+        model.vectorize(VECTORIZED_CELLS)
         self.newton = Newton(model, config)
         tableau = config.tableau
         self._ends_with_stage = tableau.weights is None
@@ -113,7 +118,9 @@ class ImplicitStepper(Stepper):
 
     @property
     def linear_solver(self) -> str:
-        return str(self.newton.linear)
+        threads = self.model.team.size
+        divided = f"; the matrix on {threads} threads" if self.newton.potential.operator.divided else ""
+        return f"{self.newton.linear}{divided}"
 
     def arrays(self) -> list[wp.array]:
         own = [array for pair in self._rates for array in pair]

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
+from warpfem.launches import Launcher, Total
 from warpfem.linear import Hessian, TangentOperator, tangent_operator
 from warpfem.model import Model, Route
 from warpfem.points import CHUNK, chunks
@@ -139,14 +140,15 @@ class IncrementalPotential:
         self.kernels = _kernels(model.dim, model.dtype)
         self.operator: TangentOperator = tangent_operator(model, differential)
         self.predicted, self.force, self.part = (model.zeros() for _ in range(3))
-        self._sum = wp.zeros(1, dtype=wp.float64, device=model.device)
+        self._sum = Total(model.device)
+        self._launcher = Launcher(model.device)
         self._barriers = [block for block in model.blocks if block.kernels.constitutive.barrier]
         limited = self._barriers or (model.contact is not None and model.contact.limits_steps)
         self._limit = wp.zeros(1, dtype=model.types.scalar, device=model.device) if limited else None
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        own = [self.predicted, self.force, self.part, self._sum]
+        own = [self.predicted, self.force, self.part, self._sum.array]
         if self._limit is not None:
             own.append(self._limit)
         return [*own, *self.operator.arrays()]
@@ -190,22 +192,17 @@ class IncrementalPotential:
 
     def value(self, d: wp.array, u: wp.array) -> float:
         """Phi of the increment d, which leads to u [J]."""
-        model, total = self.model, self._sum
-        total.zero_()
-        wp.launch(
-            self.kernels.inertia_energy,
-            chunks(model.point_count),
-            inputs=[model.mass, self.weight, self.predicted, d],
-            outputs=[total],
-            device=model.device,
-        )
+        model, total = self.model, self._sum.array
+        self._sum.clear()
+        inputs = [model.mass, self.weight, self.predicted, d]
+        self._launcher(self.kernels.inertia_energy, chunks(model.point_count), inputs, [total])
         for block in model.blocks:
             block.launch("energy", [u], [total])
         if model.contact is not None:
             model.contact.add_energy(u, total)
             model.contact.add_friction_energy(self.base, self.duration, u, total)
         load = 0.0 if model.dead_load is None else model.dot(model.dead_load, u)
-        return float(total.numpy()[0]) - load
+        return self._sum.read() - load
 
     def unbalanced_force(self, d: wp.array, u: wp.array) -> tuple[np.ndarray, np.ndarray]:
         """Writes -dPhi/dd to :attr:`force`.
@@ -242,7 +239,8 @@ class IncrementalPotential:
         return self._norms(vector)
 
     def _norms(self, vector: wp.array) -> np.ndarray:
-        parts = [vector[points] for points, _ in self.model.body_slices]
+        bodies = self.model.body_slices
+        parts = [vector] if len(bodies) == 1 else [vector[points] for points, _ in bodies]
         return np.sqrt([self.model.dot(part, part) for part in parts])
 
     def linearize(self, u: wp.array, hessian: Hessian) -> None:
@@ -257,9 +255,9 @@ class IncrementalPotential:
         """
         model = self.model
         arguments = [self.operator.inverse_diagonal, model.mass, self.weight, model.types.epsilon, u, d]
-        self._sum.zero_()
-        self._launch("rounding", arguments, [self.part, self._sum])
-        work = float(self._sum.numpy()[0])
+        self._sum.clear()
+        self._launch("rounding", arguments, [self.part, self._sum.array])
+        work = self._sum.read()
         return self._free_norms(self.part), work
 
     def longest_step(self, u: wp.array, direction: wp.array, contact_only: bool = False) -> float:
@@ -287,5 +285,4 @@ class IncrementalPotential:
         return float(self._limit.numpy()[0]) < 1.0
 
     def _launch(self, name: str, inputs: list, outputs: list) -> None:
-        kernel, model = getattr(self.kernels, name), self.model
-        wp.launch(kernel, model.point_count, inputs=inputs, outputs=outputs, device=model.device)
+        self._launcher(getattr(self.kernels, name), self.model.point_count, inputs, outputs)

@@ -13,7 +13,7 @@ def setup(problem, options):
     material = kind(E=float(problem["E"]), nu=float(problem["nu"]))
     body = wf.Body("beam", mesh, material, density=float(problem["density"]), supports=[wf.Pin("fixed")])
     scene = wf.Scene([body], wf.BackwardEuler(), gravity=(0.0, float(problem["gravity"]), 0.0))
-    solver = wf.StaticEquilibrium(tolerance=options["tolerance"])
+    solver = wf.StaticEquilibrium(tolerance=options["tolerance"], linear_solver=options.get("linear_solver", "auto"))
     last = {}
 
     def run():
