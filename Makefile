@@ -18,7 +18,7 @@ $(VENV)/installed: pyproject.toml
 
 # What the demo and some tests like to have but can do without: a failure is no obstacle, and is tried again.
 $(VENV)/extras: $(VENV)/installed
-	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[plot,mesh,progress,bench,solvers]'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[plot,mesh,progress,bench,solvers,cluster]'
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[tet]' && touch $@ || true
 
 demo: $(VENV)/extras

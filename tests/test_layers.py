@@ -22,7 +22,7 @@ LAYERS = [
         "strips",
         "subnormals",
     },
-    {"mesh", "points", "quantities", "launches"},
+    {"mesh", "points", "launches", "quantities"},
     {"materials"},
     {"stiffness"},
     {"elements", "meshing", "folds", "patches", "patch_kernels", "places"},

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warpfem
 from warpfem.checkpoint import Checkpoint, checkpoint_path
@@ -25,6 +25,9 @@ from warpfem.errors import MissingExtraError, OutputError, SimulationError, Time
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
 from warpfem.solvers import StaticEquilibrium
+
+if TYPE_CHECKING:
+    from warpfem.trade.sweep import Sweep
 
 OK, FAILED, WRONG_USE = 0, 1, 2
 
@@ -38,6 +41,7 @@ EXTRAS = {
     "tqdm": "progress",
     "scipy": "bench",
     "scikit-fem": "bench",
+    "distributed": "cluster",
 }
 """Optional packages and the extra that brings them."""
 
@@ -575,45 +579,19 @@ def _trade(arguments: argparse.Namespace) -> int:
     and several times, and compares them with a reference that is finer in space and time.
 
     Writes trade.csv, trade.json and, with the extra 'plot', trade.png and trade.svg. A study that was interrupted or
-    killed goes on from the runs that it has when the same command is given again.
+    killed goes on from the runs that it has when the command is given again. Exits with 1 if there is no reference,
+    or none that is good enough for an error that was asked for.
     """
     from warpfem.trade import report
-    from warpfem.trade.axes import default_axes, mesh_control, parse_axes, settings_of
-    from warpfem.trade.executors import cluster_executor, local_executor
     from warpfem.trade.plot import plot
-    from warpfem.trade.problem import Problem
-    from warpfem.trade.store import Store
-    from warpfem.trade.study import Study
-    from warpfem.trade.sweep import TARGETS, require_quantity, sweep
 
-    _start_warp()
-    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
-    mesh = mesh_control(problem)
-    axes = parse_axes(arguments.axes, problem) or default_axes(problem, mesh)
-    out = arguments.out or Path("output") / f"{arguments.scene.stem}.trade"
-    alone = arguments.workers == 1 and arguments.scheduler is None
     say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
-    executor = cluster_executor(arguments.scheduler) if arguments.scheduler else local_executor(arguments.workers)
-    with executor as pool:
-        study = Study(
-            problem,
-            Store(out),
-            pool,
-            load="serial" if alone else "parallel",
-            limit=float(arguments.limit),
-            threads=None if alone else 1,
-            say=say,
-        )
-        require_quantity(study, arguments.quantity)
-        say(f"{arguments.scene}: {len(settings_of(axes, problem))} settings of {', '.join(a.name for a in axes)}")
-        done = sweep(
-            study,
-            axes,
-            mesh,
-            name=arguments.quantity,
-            targets=arguments.errors or TARGETS,
-            repeats=arguments.repeats,
-        )
+    out = arguments.out or Path("output") / f"{arguments.scene.stem}.trade"
+    _start_warp()
+    try:
+        done = _sweep(arguments, out, say)
+    except KeyboardInterrupt:
+        return _fail(SimulationError(f"interrupted: what has been run is in {out}, and the command goes on"), FAILED)
     written = report.write(done, out)
     if done.reference is not None:
         try:
@@ -625,7 +603,39 @@ def _trade(arguments: argparse.Namespace) -> int:
     else:
         print(report.text(done))
         print(f"wrote {', '.join(map(str, written))}")
-    return FAILED if done.reference is None or any(answer.refusal for answer in done.answers) else OK
+    refused = arguments.errors is not None and any(answer.refusal for answer in done.answers)
+    return FAILED if done.reference is None or refused else OK
+
+
+def _sweep(arguments: argparse.Namespace, out: Path, say: Callable[[str], None]) -> Sweep:
+    """Runs the study; what can be wrong with the command is said before anything is run."""
+    from warpfem.trade.axes import default_axes, mesh_control, parse_axes, settings_of
+    from warpfem.trade.executors import cluster_executor, local_executor
+    from warpfem.trade.problem import Problem
+    from warpfem.trade.store import Store
+    from warpfem.trade.study import Study
+    from warpfem.trade.sweep import TARGETS, require_quantity, sweep
+
+    problem = Problem.of(arguments.scene, _parameters(arguments), frames=arguments.frames, device=arguments.device)
+    axes = parse_axes(arguments.axes, problem)
+    mesh = mesh_control(problem)
+    axes = axes or default_axes(problem, mesh)
+    require_quantity(problem, arguments.quantity)
+    say(f"{arguments.scene}: {len(settings_of(axes, problem))} settings of {', '.join(axis.name for axis in axes)}")
+    alone = arguments.workers == 1 and arguments.scheduler is None
+    executor = cluster_executor(arguments.scheduler) if arguments.scheduler else local_executor(arguments.workers)
+    with executor as pool:
+        study = Study(
+            problem,
+            Store(out),
+            pool,
+            load="serial" if alone else "parallel",
+            limit=float(arguments.limit),
+            threads=None if alone else 1,
+            say=say,
+        )
+        targets = arguments.errors or TARGETS
+        return sweep(study, axes, mesh, name=arguments.quantity, targets=targets, repeats=arguments.repeats)
 
 
 def _preview(arguments: argparse.Namespace) -> int:

@@ -23,6 +23,9 @@ TIME = ("dt", "solver", "error")
 ALGEBRA = ("tolerance", "linear_tolerance", "dtype", "max_iterations", "linear_iterations", "linear_solver")
 """Axes whose names say which error they bear on, if they are not parameters that change the mesh."""
 
+CLEARLY_MORE = 1.5
+"""Ratio of cells from which on a mesh is a finer one: generators do not give the same number each time."""
+
 
 @dataclass(frozen=True)
 class Axis:
@@ -144,7 +147,7 @@ def _makes_finer(problem: Problem, plain: Scene, setting: Setting) -> bool:
         size = other.mesh.bounding_box[1] - other.mesh.bounding_box[0]
         if (abs(body.mesh.bounding_box - other.mesh.bounding_box) > 0.05 * size.max()).any():
             return False
-    return _cells(scene) > _cells(plain)
+    return _cells(scene) > CLEARLY_MORE * _cells(plain)
 
 
 def _cells(scene: Scene) -> int:

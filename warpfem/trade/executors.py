@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from warpfem.errors import MissingExtraError, OutputError
 from warpfem.trade.process import end_all
 
+PATIENCE = "10s"
+"""How long a scheduler may take to answer."""
+
 
 @contextmanager
 def local_executor(workers: int) -> Iterator[Executor]:
@@ -43,7 +46,7 @@ def cluster_executor(address: str) -> Iterator[Executor]:
     except ImportError:
         raise MissingExtraError("--scheduler", "distributed", "cluster") from None
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise OutputError(f"no Dask scheduler answers at {address}: {error}") from None
     with client:

@@ -40,9 +40,9 @@ def measure(order: Order) -> Outcome:
 
 
 def _measure(order: Order, outcome: Outcome) -> None:
-    problem, setting = order.request
+    problem = order.problem
     problem.require_same_file()
-    choice = problem.build(setting)
+    choice = problem.build(order.setting)
     threads = order.threads or available_threads()
     with _kernel_seconds() as seconds:
         simulation = _simulation(choice, problem.device, threads)

@@ -7,6 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from warpfem.trade.problem import Problem, Setting
+
 Load = Literal["serial", "parallel"]
 """Whether other runs of the study ran at the same time."""
 
@@ -16,7 +18,8 @@ class Order:
     """What a worker is asked to run. Plain data, which any process can be sent.
 
     Attributes:
-        request: the problem and the setting.
+        problem: the problem.
+        setting: the setting.
         places: rest positions of each body at which the motion is recorded [(k, dim) arrays, m].
         rounds: runs of the scene in this process at most, as long as they are short.
         seconds: wall time that the process may take [s].
@@ -24,7 +27,8 @@ class Order:
         threads: threads that explicit steps may use; ``None`` for all cores.
     """
 
-    request: Any
+    problem: Problem
+    setting: Setting
     places: list[np.ndarray]
     rounds: int
     seconds: float

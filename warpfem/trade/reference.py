@@ -2,24 +2,25 @@
 
 Two ladders of runs, in float64 and with a tight tolerance, of quadratic cells and a scheme of third order: one of
 meshes with a fixed time step, one of time steps with the coarsest of these meshes. Each is extrapolated, and the sum of
-the limit in space and of what is missing in time is the reference. A ladder grows by a level until the reference is
-four times as accurate as the best setting, or the next run would take too long.
+the limit in space and of what is missing in time is the reference; how that depends on the mesh, the second mesh tells.
+The ladders grow until the reference is four times as accurate as the best setting, or the next run would take too long.
 
 Explicit steps are as long as each mesh allows: their errors fall with those of the mesh, and one ladder does.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from warpfem.errors import SimulationError
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import MeshControl
-from warpfem.trade.extrapolation import CLAIM, Extrapolated, extrapolate
+from warpfem.trade.ladders import LadderSum, Part, Rung
 from warpfem.trade.outcome import Outcome
 from warpfem.trade.problem import FORCED, Setting
 from warpfem.trade.study import Difference, Point, Study, difference
@@ -36,29 +37,8 @@ L2, LARGEST = "l2", "max"
 MOST_LEVELS = 6
 """Levels of a ladder beyond which a finer one is not the answer."""
 
-
-@dataclass(frozen=True, eq=False)
-class Rung:
-    """A level of a ladder."""
-
-    setting: Setting
-    size: float
-    outcome: Outcome
-
-
-@dataclass(frozen=True)
-class Part:
-    """What one ladder, or the algebra, leaves open of a quantity.
-
-    Attributes:
-        order: observed; ``None`` if there is none.
-        band: relative to the scale of the quantity.
-        remark: why there is no order.
-    """
-
-    order: float | None
-    band: float
-    remark: str = ""
+LEAST_CHANGE = 0.95
+"""Part of the mesh size down to which a mesh has to go to be a finer one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +83,9 @@ def relative(own: Difference, scales: dict[str, float]) -> dict[str, float]:
     return {name: absolute[name] / scale for name, scale in scales.items() if name in absolute and scale > 0.0}
 
 
-def build_reference(study: Study, mesh: MeshControl, asked: Sequence[Point], name: str = L2) -> Reference:
+def build_reference(
+    study: Study, mesh: MeshControl, asked: Sequence[Point], name: str = L2, least: float = 0.0
+) -> Reference:
     """The reference of settings that have been run.
 
     Args:
@@ -111,194 +93,204 @@ def build_reference(study: Study, mesh: MeshControl, asked: Sequence[Point], nam
         mesh: makes meshes finer.
         asked: the settings that it has to be more accurate than.
         name: of what: a norm, or a quantity of the scene.
+        least: the smallest relative error that matters: that of a number can be nothing by accident.
 
     Raises:
-        SimulationError: no ladder of two levels could be run.
+        SimulationError: no ladder of two levels could be run, or the quantity has no value.
     """
-    return _Builder(study, mesh, [point for point in asked if not point.failure]).build(name)
+    return _Builder(study, mesh, [point for point in asked if not point.failure]).build(name, least)
 
 
 class _Builder:
+    """The ladders while they grow.
+
+    ``meshes`` and ``steps`` (of a frame) are their levels from coarse to fine. All meshes are run with the steps of the
+    level ``shared``, and all steps with the first mesh.
+    """
+
     def __init__(self, study: Study, mesh: MeshControl, asked: Sequence[Point]) -> None:
         self.study = study
         self.mesh = mesh
         self.asked = asked
         self.implicit = isinstance(study.scene.solver, ImplicitSolver)
         self.remarks: list[str] = []
-        self.space: list[Rung] = []
-        self.time: list[Rung] = []
-        self.algebra: Outcome | None = None  # with a hundred times the tolerance, which changes more than it does
+        self.meshes: list[Setting] = []
+        self.steps = self._first_steps()
+        self.shared = 1 if self.implicit else 0
 
-    def build(self, name: str) -> Reference:
+    def build(self, name: str, least: float) -> Reference:
         self._begin()
         while True:
-            reference = self._reference()
-            best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
-            need = best / MARGIN
+            reference, cross = self._reference()
             parts = reference.parts.get(name)
             if parts is None:
-                known = ", ".join(reference.names)
-                raise SimulationError(f"the reference has no value of '{name}': it has {known}")
-            if reference.band(name) <= need:
-                return reference
-            ladders = ["space", "time"] if self.implicit else ["space"]
-            ladders.sort(key=lambda kind: -parts[kind].band)
-            if "algebra" in parts and parts["algebra"].band > max(parts[kind].band for kind in ladders):
-                self.remarks.append("rounding or the tolerance of the solver limits the reference")
-                return self._reference()
-            for kind in ladders:
-                if parts[kind].band > 0.25 * need and self._grow(kind):
-                    break
-            else:
-                return self._reference()
+                raise SimulationError(f"the reference has no value of '{name}': it has {', '.join(reference.names)}")
+            best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
+            need = max(best, least) / MARGIN
+            growths = {"space": self._grow_mesh}
+            if self.implicit:
+                growths["time"] = (
+                    self._share_finer_steps if cross[name] > 0.5 * parts["time"].band else self._grow_steps
+                )
+            order = sorted(growths, key=lambda kind: -parts[kind].band)
+            wanted = [kind for kind in order if parts[kind].band > need / MARGIN]
+            if reference.band(name) <= need or not any(growths[kind]() for kind in wanted):
+                return replace(reference, remarks=list(dict.fromkeys(self.remarks)))
 
     # ---- ladders
 
     def _begin(self) -> None:
+        """The first levels: three, or two meshes if a third is not to be had."""
         if not self.asked:
             raise SimulationError("there is no reference: every setting failed")
         start = max(self.asked, key=lambda point: point.first.mesh_size).setting.only(self.mesh.names)
         for element in ("quadratic", "linear"):
-            base = start.changed(**{f"{FORCED}element": element})
-            steps = self._first_steps()
-            settings = [self._timed(base, count) for count in steps]
-            finer = self.mesh.finer(base, 2.0)
-            meshes = [self._timed(own, steps[-2]) for own in (finer,) if own is not None]
-            rough = self._timed(base, steps[-2]).changed(**{f"{FORCED}tolerance": COARSE_TOLERANCE})
-            extra = [rough] if self.implicit else []
-            points = self.study.solve(settings + meshes + extra)
-            failures = [point.failure for point in points if point.failure]
-            if not failures:
+            first = start.changed(**{f"{FORCED}element": element})
+            second = self.mesh.finer(first, 2.0)
+            self.meshes = [first] if second is None else [first, second]
+            failure = self._failure(self._settings())
+            if not failure:
                 break
-            self.remarks.append(f"{element} cells failed as a reference: {failures[0]}")
+            self.remarks.append(f"{element} cells failed as a reference: {failure}")
         else:
-            raise SimulationError(f"there is no reference: {failures[0]}")
-        rungs = [_rung(point) for point in points]
-        self.time = rungs[: len(settings)]
-        self.space = [self.time[-2], *rungs[len(settings) : len(settings) + len(meshes)]]
-        self.algebra = rungs[-1].outcome if self.implicit else None
-        if len(self.space) < 2 or (len(self.space) < 3 and not self._grow("space")):
-            self.remarks.append("the meshes for an observed order would take too long")
-        if len(self.space) < 2:
+            raise SimulationError(f"there is no reference: {failure}")
+        self._grow_mesh()
+        if len(self.meshes) < 2:
             raise SimulationError("there is no reference: " + "; ".join(self.remarks))
 
     def _first_steps(self) -> list[int]:
         """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh."""
         if not self.implicit:
-            return [0, 0]
+            return [0]
         interval = 1.0 / self.study.scene.fps
         shortest = min((p.first.shortest_dt for p in self.asked if p.first.shortest_dt > 0.0), default=interval)
         most = max(4, 2 ** math.ceil(math.log2(max(1.0, interval / shortest) - 1e-6)))
         return [most // 4, most // 2, most]
 
-    def _timed(self, base: Setting, steps: int) -> Setting:
-        """The setting with that many steps of a frame, accurate in time; 0 for as few as are stable."""
+    def _timed(self, mesh: Setting, steps: int) -> Setting:
+        """A mesh with that many steps of a frame."""
         if not self.implicit:
-            fine = {"dtype": "float64", f"{FORCED}solver": "velocity_verlet", f"{FORCED}dt": "auto"}
-        else:
-            dt = f"1/{self.study.scene.fps * steps:.12g}"
-            fine = {**FINE_ALGEBRA, f"{FORCED}solver": "sdirk3", f"{FORCED}dt": dt}
-        return base.changed(**fine)
+            return mesh.changed(**{"dtype": "float64", f"{FORCED}solver": "velocity_verlet", f"{FORCED}dt": "auto"})
+        dt = f"1/{self.study.scene.fps * steps:.12g}"
+        return mesh.changed(**{**FINE_ALGEBRA, f"{FORCED}solver": "sdirk3", f"{FORCED}dt": dt})
 
-    def _grow(self, kind: str) -> bool:
-        """Adds a level to a ladder; false if that is not to be had."""
-        ladder = self.space if kind == "space" else self.time
-        if len(ladder) >= MOST_LEVELS:
-            self.remarks.append(f"{MOST_LEVELS} levels in {kind} are not enough")
+    def _space(self) -> list[Setting]:
+        return [self._timed(mesh, self.steps[self.shared]) for mesh in self.meshes]
+
+    def _time(self) -> list[Setting]:
+        return [self._timed(self.meshes[0], steps) for steps in self.steps] if self.implicit else []
+
+    def _crossed(self) -> list[Setting]:
+        """The second mesh with the finest steps, which tells how the error in time depends on the mesh."""
+        return [self._timed(self.meshes[1], self.steps[-1])] if self.implicit and len(self.meshes) > 1 else []
+
+    def _rough(self) -> list[Setting]:
+        """The first mesh with a hundred times the tolerance, which changes more than the tolerance does."""
+        return [self._space()[0].changed(**{f"{FORCED}tolerance": COARSE_TOLERANCE})] if self.implicit else []
+
+    def _settings(self) -> list[Setting]:
+        return [*self._time(), *self._space(), *self._crossed(), *self._rough()]
+
+    def _failure(self, settings: list[Setting]) -> str:
+        """Why some of them failed; empty if none has."""
+        return next((point.failure for point in self.study.solve(settings) if point.failure), "")
+
+    def _grow_mesh(self) -> bool:
+        """Adds a finer mesh; false if that is not to be had."""
+        if len(self.meshes) == MOST_LEVELS:
+            self.remarks.append(f"{MOST_LEVELS} meshes are not enough")
             return False
-        last = ladder[-1]
-        dim = self.study.scene.dim
+        last = self.study.solve(self._space()[-1:])[0].first
         for factor in (2.0, 1.5):
-            if kind == "space":
-                finer = self.mesh.finer(last.setting, factor)
-                cost = factor ** (dim + 1)
-            else:
-                old = float(last.setting[f"{FORCED}dt"].partition("/")[2]) / self.study.scene.fps
-                finer = self._timed(last.setting, math.ceil(factor * old))
-                cost = factor
-            if finer is None:
+            finer = self.mesh.finer(self.meshes[-1], factor)
+            if finer is None or not self._affordable(factor ** (self.study.scene.dim + 1) * last.seconds[0]):
                 continue
-            expected = cost * last.outcome.seconds[0]
-            if expected > self.study.limit:
-                continue
-            (point,) = self.study.solve([finer])
+            (point,) = self.study.solve([self._timed(finer, self.steps[self.shared])])
             if point.failure:
-                self.remarks.append(f"a finer reference in {kind} failed: {point.failure}")
+                self.remarks.append(f"a finer mesh failed as a reference: {point.failure}")
                 return False
-            if kind == "space" and not point.first.mesh_size < 0.95 * last.size:
-                continue
-            ladder.append(_rung(point))
-            return True
-        self.remarks.append(f"a finer reference in {kind} would take more than {self.study.limit:g} s")
+            if point.first.mesh_size < LEAST_CHANGE * last.mesh_size:
+                self.meshes.append(finer)
+                return True
+        self.remarks.append(f"a reference with a finer mesh would take more than {self.study.limit:g} s")
         return False
+
+    def _grow_steps(self) -> bool:
+        """Adds shorter steps; false if that is not to be had."""
+        if len(self.steps) == MOST_LEVELS:
+            self.remarks.append(f"{MOST_LEVELS} lengths of steps are not enough")
+            return False
+        slowest = max(point.first.seconds[0] for point in self.study.solve([self._time()[-1], *self._crossed()]))
+        if not self._affordable(2.0 * slowest):
+            self.remarks.append(f"a reference with shorter steps would take more than {self.study.limit:g} s")
+            return False
+        self.steps.append(2 * self.steps[-1])
+        failure = self._failure([*self._time(), *self._crossed()])
+        if failure:
+            self.steps.pop()
+            self.remarks.append(f"shorter steps failed as a reference: {failure}")
+        return not failure
+
+    def _share_finer_steps(self) -> bool:
+        """Runs all meshes with shorter steps; false if that is not to be had."""
+        if self.shared + 2 > len(self.steps) - 1 and not self._grow_steps():
+            return False
+        slowest = self.study.solve(self._space()[-1:])[0].first.seconds[0]
+        ratio = self.steps[self.shared + 1] / self.steps[self.shared]
+        if not self._affordable(ratio * slowest):
+            self.remarks.append(f"all meshes with shorter steps would take more than {self.study.limit:g} s")
+            return False
+        self.shared += 1
+        failure = self._failure(self._settings())
+        if failure:
+            self.shared -= 1
+            self.remarks.append(f"shorter steps failed as a reference: {failure}")
+        return not failure
+
+    def _affordable(self, seconds: float) -> bool:
+        return seconds <= self.study.limit
 
     # ---- the sum
 
-    def _reference(self) -> Reference:
-        motion = extrapolate([r.outcome.motion for r in self.space], [r.size for r in self.space])
-        bare = self.space[0].outcome  # the coarsest mesh with the time step of all meshes
-        field_parts = {"space": motion}
-        limits = {"space": Outcome(times=bare.times, motion=motion.value)}
-        total = motion.value
-        missing: np.ndarray | float = 0.0
-        if self.implicit:
-            in_time = extrapolate([r.outcome.motion for r in self.time], [r.outcome.longest_dt for r in self.time])
-            field_parts["time"] = in_time
-            limits["time"] = Outcome(times=bare.times, motion=in_time.value)
-            missing = in_time.value - bare.motion
-            total = total + missing
-        scales = {L2: _peak_rms(total), LARGEST: float(np.linalg.norm(total, axis=-1).max())}
+    def _reference(self) -> tuple[Reference, dict[str, float]]:
+        """The reference that the ladders give, and the part of each band in time that depends on the mesh."""
+        space, time = (
+            [_rung(point) for point in self.study.solve(settings)] for settings in (self._space(), self._time())
+        )
+        crossed, rough = (
+            [point.first for point in self.study.solve(settings)] for settings in (self._crossed(), self._rough())
+        )
+        levels = space, time, crossed, rough
+        sums = {LARGEST: LadderSum(*levels, lambda outcome: outcome.motion)}
+        reached = [*(rung.outcome for rung in (*space, *time)), *crossed, *rough]
+        for name in space[0].outcome.quantities:
+            if all(name in outcome.quantities for outcome in reached):
+                sums[name] = LadderSum(*levels, functools.partial(_number, name))
+        motion = sums[LARGEST].value
+        scales = {L2: _peak_rms(motion), LARGEST: float(np.linalg.norm(motion, axis=-1).max())}
         if scales[LARGEST] == 0.0:
             raise SimulationError("nothing moves in this scene: there is no error to measure")
-        parts: dict[str, dict[str, Part]] = {L2: {}, LARGEST: {}}
-        for kind, own in field_parts.items():
-            cross = (0.0, 0.0) if kind == "space" else _norms(missing)  # measured on the coarsest mesh
-            parts[L2][kind] = Part(own.order, (own.band + CLAIM * cross[0]) / scales[L2], own.remark)
-            parts[LARGEST][kind] = Part(own.order, (own.largest_band + CLAIM * cross[1]) / scales[LARGEST], own.remark)
-        rough = None if self.algebra is None else difference(self.algebra, bare)
-        if rough is not None:
-            parts[L2]["algebra"] = Part(None, rough.l2 / scales[L2])
-            parts[LARGEST]["algebra"] = Part(None, rough.largest / scales[LARGEST])
-        quantities = {}
-        for name in self._shared_quantities():
-            value, scale, parts[name] = self._quantity(name, bare, rough, limits)
-            quantities[name] = value
-            scales[name] = scale
-        outcome = Outcome(times=bare.times, motion=total, quantities=quantities)
-        ladders = {"space": self.space, "time": self.time}
-        return Reference(outcome, scales, parts, ladders, limits, list(self.remarks))
-
-    def _shared_quantities(self) -> list[str]:
-        rungs = [*self.space, *(self.time if self.implicit else ())]
-        return [name for name in self.space[0].outcome.quantities if all(name in r.outcome.quantities for r in rungs)]
-
-    def _quantity(
-        self, name: str, bare: Outcome, rough: Difference | None, limits: dict[str, Outcome]
-    ) -> tuple[float, float, dict[str, Part]]:
-        """The reference's value of a quantity, what its errors are relative to, and the bands."""
-
-        def limit(rungs: list[Rung], sizes: list[float]) -> Extrapolated:
-            return extrapolate([np.array([r.outcome.quantities[name]]) for r in rungs], sizes)
-
-        space = limit(self.space, [r.size for r in self.space])
-        value, bands = float(space.value[0]), {"space": space}
-        limits["space"].quantities[name] = value
-        cross = 0.0
-        if self.implicit:
-            bands["time"] = limit(self.time, [r.outcome.longest_dt for r in self.time])
-            limits["time"].quantities[name] = float(bands["time"].value[0])
-            cross = float(bands["time"].value[0]) - bare.quantities[name]
-            value += cross
-        scale = abs(value)
-        if scale == 0.0:
-            scale = math.nan
-        parts = {
-            kind: Part(own.order, (own.band + (CLAIM * abs(cross) if kind == "time" else 0.0)) / scale, own.remark)
-            for kind, own in bands.items()
+        parts = {L2: sums[LARGEST].parts(scales[L2], 0), LARGEST: sums[LARGEST].parts(scales[LARGEST], 1)}
+        cross = {L2: sums[LARGEST].cross[0] / scales[L2], LARGEST: sums[LARGEST].cross[1] / scales[LARGEST]}
+        values = {name: float(own.value[0]) for name, own in sums.items() if name != LARGEST}
+        for name, value in values.items():
+            scales[name] = abs(value) or math.nan
+            # a number can stand still by accident: it is claimed to be no more accurate than the motion that it is of
+            parts[name] = {
+                kind: replace(part, band=max(part.band, parts[L2][kind].band))
+                for kind, part in sums[name].parts(scales[name], 0).items()
+            }
+            cross[name] = max(sums[name].cross[0] / scales[name], cross[L2])
+        limits = {
+            kind: Outcome(
+                times=space[0].outcome.times,
+                motion=sums[LARGEST].limits[kind].value,
+                quantities={name: float(sums[name].limits[kind].value[0]) for name in values},
+            )
+            for kind in sums[LARGEST].limits
         }
-        if rough is not None:
-            parts["algebra"] = Part(None, abs(rough.quantities.get(name, 0.0)) / scale)
-        return value, scale, parts
+        outcome = Outcome(times=space[0].outcome.times, motion=motion, quantities=values)
+        return Reference(outcome, scales, parts, {"space": space, "time": time}, limits), cross
 
 
 def _rung(point: Point) -> Rung:
@@ -309,6 +301,5 @@ def _peak_rms(motion: np.ndarray) -> float:
     return float(np.sqrt((motion**2).sum(axis=-1).mean(axis=-1)).max())
 
 
-def _norms(field: np.ndarray | float) -> tuple[float, float]:
-    lengths = np.linalg.norm(field, axis=-1)
-    return float(np.sqrt((lengths**2).mean())), float(lengths.max())
+def _number(name: str, outcome: Outcome) -> np.ndarray:
+    return np.array([outcome.quantities[name]])

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warpfem.errors import OutputError
-from warpfem.files import save_arrays
+from warpfem.files import replacing
 from warpfem.trade.outcome import Outcome
 from warpfem.trade.problem import Problem, Setting
-
-ARRAYS = ("times", "motion")
 
 
 class Store:
     """The outcomes of a study, in a folder.
 
-    ``runs.jsonl`` has a line for each, and ``motions/KEY.npz`` the recorded motion of each setting, that of its first
-    run without failure.
+    ``runs.jsonl`` has a line for each, and ``motions/KEY.npy`` the recorded motion of each setting, that of its first
+    run without failure: all its runs have the same.
 
     Args:
         folder: is made if it does not exist.
@@ -53,11 +51,12 @@ class Store:
         """
         key = problem.key(setting)
         try:
-            if not outcome.failure and not self._motion(key).exists():
-                save_arrays(self._motion(key), {name: getattr(outcome, name) for name in ARRAYS})
-            record = asdict(outcome)
-            for name in ARRAYS:
-                del record[name]
+            motion = self._motion(key)
+            if not outcome.failure and not motion.exists():
+                with replacing(motion) as temporary, open(temporary, "wb") as array:
+                    np.save(array, outcome.motion)
+            record = asdict(replace(outcome, motion=np.zeros(0))) | {"times": outcome.times.tolist()}
+            del record["motion"]
             line = json.dumps({"key": key, "setting": dict(setting), **record}) + "\n"
             file = os.open(self._lines, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             try:
@@ -65,12 +64,14 @@ class Store:
                 os.fsync(file)
             finally:
                 os.close(file)
+            if not outcome.failure:
+                outcome.motion = np.load(motion, mmap_mode="r")
         except OSError as error:
             raise OutputError(f"cannot write to {self.folder}: {error.strerror or error}") from None
         self._outcomes.setdefault(key, []).append(outcome)
 
     def _motion(self, key: str) -> Path:
-        return self.folder / "motions" / f"{key}.npz"
+        return self.folder / "motions" / f"{key}.npy"
 
     def _read(self) -> None:
         known = {field.name for field in fields(Outcome)}
@@ -85,9 +86,9 @@ class Store:
                 continue
             key = record.get("key", "")
             outcome = Outcome(**{name: value for name, value in record.items() if name in known})
+            outcome.times = np.array(outcome.times)
             if not outcome.failure:
                 if not self._motion(key).exists():
                     continue  # somebody removed it: run it again
-                with np.load(self._motion(key)) as arrays:
-                    outcome.times, outcome.motion = arrays["times"], arrays["motion"]
+                outcome.motion = np.load(self._motion(key), mmap_mode="r")
             self._outcomes.setdefault(key, []).append(outcome)

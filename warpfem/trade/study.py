@@ -116,7 +116,7 @@ class Study:
         share = max(1, PLACES // len(self.scene.bodies))
         self.places = [spread_places(body.mesh, share) for body in self.scene.bodies]
 
-    def run(self, settings: Sequence[Setting], repeats: int = 1, *, limit: float | None = None) -> list[Point]:
+    def run(self, settings: Sequence[Setting], repeats: int = 1) -> list[Point]:
         """Runs settings, round after round, so that slow changes of the machine's speed show in the spread.
 
         Outcomes that the store has, of the same load, are not run again.
@@ -124,7 +124,6 @@ class Study:
         Args:
             settings: the settings.
             repeats: processes for each.
-            limit: wall time of a process [s], if not that of the study.
 
         Returns:
             Their points, in the same order.
@@ -132,36 +131,38 @@ class Study:
         Raises:
             OutputError: an outcome cannot be stored, or the cluster is lost.
         """
-        seconds = self.limit if limit is None else limit
         for round in range(repeats):
-            missing = [s for s in dict.fromkeys(settings) if self._lacks(s, round + 1, seconds)]
-            for setting, outcome in self._run_each(missing, seconds):
-                self.store.add(self.problem, setting, outcome)
-                told = outcome.failure or f"{statistics.median(outcome.seconds):.3g} s of steps"
-                self.say(f"{setting.label}: {told}")
+            self._run_missing(settings, round + 1, ROUNDS)
         return [Point(setting, tuple(self._own(setting))) for setting in settings]
 
-    def solve(self, settings: Sequence[Setting], *, limit: float | None = None) -> list[Point]:
+    def solve(self, settings: Sequence[Setting]) -> list[Point]:
         """As :meth:`run`, once, for the motion alone: an outcome of any load will do."""
         known = {s: [o for o in self.store.outcomes(self.problem, s) if not o.failure] for s in settings}
-        missing = [setting for setting, outcomes in known.items() if not outcomes]
-        found = dict(zip(missing, self.run(missing, limit=limit), strict=True))
-        return [found.get(setting) or Point(setting, tuple(known[setting])) for setting in settings]
+        self._run_missing([setting for setting, outcomes in known.items() if not outcomes], 1, 1)
+        return [Point(s, tuple(known[s] or self._own(s))) for s in settings]
+
+    def _run_missing(self, settings: Sequence[Setting], count: int, rounds: int) -> None:
+        """Runs the settings that have fewer than ``count`` outcomes, once."""
+        missing = [setting for setting in dict.fromkeys(settings) if self._lacks(setting, count)]
+        for setting, outcome in self._run_each(missing, rounds):
+            self.store.add(self.problem, setting, outcome)
+            told = outcome.failure or f"{statistics.median(outcome.seconds):.3g} s of steps"
+            self.say(f"{setting.label}: {told}")
 
     def _own(self, setting: Setting) -> list[Outcome]:
         """The outcomes that count for a setting: those of the study's load."""
         return [o for o in self.store.outcomes(self.problem, setting) if o.load == self.load]
 
-    def _lacks(self, setting: Setting, count: int, seconds: float) -> bool:
+    def _lacks(self, setting: Setting, count: int) -> bool:
         own = self._own(setting)
         good = sum(not outcome.failure for outcome in own)
-        again = all(not outcome.failure or 0.0 < outcome.limit < seconds for outcome in own)
+        again = all(not outcome.failure or 0.0 < outcome.limit < self.limit for outcome in own)
         return good < count and again  # what has failed otherwise would fail again
 
-    def _run_each(self, settings: Sequence[Setting], seconds: float) -> Iterator[tuple[Setting, Outcome]]:
+    def _run_each(self, settings: Sequence[Setting], rounds: int) -> Iterator[tuple[Setting, Outcome]]:
         """Outcomes as they come; what a lost worker had in hand is submitted again."""
         orders = {
-            setting: Order((self.problem, setting), self.places, ROUNDS, seconds, self.load, self.threads)
+            setting: Order(self.problem, setting, self.places, rounds, self.limit, self.load, self.threads)
             for setting in settings
         }
         futures: dict[Future[Outcome], tuple[Setting, int]] = {

@@ -9,6 +9,7 @@ from warpfem.errors import SceneError, SimulationError
 from warpfem.trade.axes import Axis, MeshControl, settings_of
 from warpfem.trade.components import Errors, components
 from warpfem.trade.front import Answer, Candidate, answer, candidates, front
+from warpfem.trade.problem import Problem, Setting
 from warpfem.trade.reference import L2, LARGEST, Reference, build_reference
 from warpfem.trade.study import Point, Study
 
@@ -50,9 +51,9 @@ class Sweep:
         return [point for point in self.points if point.failure]
 
 
-def require_quantity(study: Study, name: str) -> None:
+def require_quantity(problem: Problem, name: str) -> None:
     """Raises SceneError unless a name is that of a norm or a quantity of the scene."""
-    known = [L2, LARGEST, *study.scene.quantities]
+    known = [L2, LARGEST, *problem.build(Setting()).scene.quantities]
     if name not in known:
         raise SceneError(f"there is no quantity '{name}': the scene has {', '.join(map(repr, known))}")
 
@@ -80,13 +81,13 @@ def sweep(
         SceneError: there is no such quantity.
         OutputError: something cannot be stored, or the cluster is lost.
     """
-    require_quantity(study, name)
+    require_quantity(study.problem, name)
     settings = settings_of(axes, study.problem)
     points = study.run(settings)
     reference, refusal = None, ""
     ordered: list[Candidate] = []
     try:
-        reference = build_reference(study, mesh, points, name)
+        reference = build_reference(study, mesh, points, name, min(targets))
     except SimulationError as error:
         refusal = str(error)
     points = study.run(settings, repeats)
