@@ -1,0 +1,170 @@
+"""Measures what accuracy costs in shipped scenes and writes docs/trade.md, with the plots beside it.
+
+    python benchmarks/trade.py [--out docs/trade.md] [--folder output/trade] [--scene NAME ...]
+
+Each study is one `warpfem trade` command, which the page names; it goes on from what an earlier run has left in the
+folder. Some ten minutes for each scene, on an idle machine.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ERRORS = ("10%", "1%", "0.1%")
+
+
+@dataclass(frozen=True)
+class Study:
+    """A scene, what of it is asked for, and what is varied.
+
+    Attributes:
+        name: of the scene file.
+        quantity: as the command takes it.
+        axes: likewise.
+        about: what moves, and why the answer is of interest.
+        options: other options of the command.
+    """
+
+    name: str
+    quantity: str
+    axes: tuple[str, ...]
+    about: str
+    options: tuple[str, ...] = ()
+
+    def command(self) -> list[str]:
+        """The arguments of ``warpfem``, without the folder."""
+        axes = [part for axis in self.axes for part in ("--axis", axis)]
+        errors = [part for error in ERRORS for part in ("--error", error)]
+        return ["trade", f"scenes/{self.name}.py", *axes, *errors, "--quantity", self.quantity, *self.options]
+
+
+STUDIES = (
+    Study(
+        "cantilever",
+        "l2",
+        ("cells=1,2,4", "element=P1,P2", "solver=backward_euler,sdirk2", "dt=1/24,1/48,1/96"),
+        "A beam falls under its weight, swings, and comes to rest by damping. Errors are of its whole motion.",
+        ("--frames", "24", "--limit", "60"),
+    ),
+    Study(
+        "jelly_drop",
+        "deepest",
+        ("cells=2,4,6", "element=P1,P2", "solver=backward_euler,sdirk2", "dt=1/60,1/240"),
+        "A soft cube falls on a floor. Errors are of how far the middle of its top comes down at the deepest.",
+        ("--frames", "18", "--limit", "60"),
+    ),
+    Study(
+        "twist",
+        "turn at mid-height",
+        ("cells=1,2,4", "element=P1,P2", "solver=backward_euler,sdirk2", "dt=1/24,1/48"),
+        "A column is twisted by half a turn of its top. Errors are of where an edge at half the height ends.",
+        ("--limit", "60"),
+    ),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("docs/trade.md"), help="the page")
+    parser.add_argument("--folder", type=Path, default=Path("output/trade"), help="where studies keep their runs")
+    names = [study.name for study in STUDIES]
+    parser.add_argument("--scene", nargs="+", choices=names, default=names, help="what to measure anew (all)")
+    options = parser.parse_args()
+    plots = options.out.with_suffix("")
+    plots.mkdir(parents=True, exist_ok=True)
+    for study in STUDIES:
+        if study.name in options.scene:
+            own = options.folder / study.name
+            done = subprocess.run([sys.executable, "-m", "warpfem", *study.command(), "--out", str(own)])
+            if done.returncode not in (0, 1):  # 1: there is no answer for some of the errors
+                sys.exit(done.returncode)
+            for name in ("trade.json", "trade.csv", "trade.png"):
+                shutil.copy(own / name, plots / f"{study.name}{Path(name).suffix}")
+    results = {s.name: json.loads(path.read_text()) for s in STUDIES if (path := plots / f"{s.name}.json").exists()}
+    options.out.write_text(page(results, plots.name))
+
+
+def page(results: dict[str, dict[str, Any]], plots: str) -> str:
+    """The page of some studies' results, whose plots are in a folder beside it."""
+    lines = [
+        "# What accuracy costs",
+        "",
+        *_prose(
+            "Written by `python benchmarks/trade.py`: studies of shipped scenes by `warpfem trade`, which runs all "
+            "settings and measures their errors against a reference that is finer in space and time, extrapolated, "
+            "with an error band of its own. Times are those of the steps, the median of some processes, without the "
+            "compilation of kernels and the set-up; in brackets the least and the greatest. Errors are relative; where "
+            "the reference's band is more than a quarter of one, only its bound is told (<)."
+        ),
+    ]
+    for study in STUDIES:
+        if study.name in results:
+            lines += _study(study, results[study.name], plots)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _study(study: Study, result: dict[str, Any], plots: str) -> list[str]:
+    machine = result["machine"]
+    lines = [
+        f"## {study.name}",
+        "",
+        *_prose(study.about),
+        "```",
+        *_wrapped_command(study),
+        "```",
+        "",
+        f"![time against error]({plots}/{study.name}.png)",
+        "",
+    ]
+    lines += [f"- {answer['sentence']}" for answer in result["answers"]]
+    reference = result["reference"]["names"][study.quantity]
+    band = reference["band"]
+    lines += ["", "The front, from fast to accurate:", "", "| setting | time | error |", "| --- | --- | --- |"]
+    for row in sorted(result["settings"], key=lambda row: row.get("seconds", 0.0)):
+        if row["on_front"]:
+            setting = " ".join(f"{name}={value}" for name, value in row["setting"].items())
+            lines.append(f"| {setting} | {_time(row)} | {_error(row, study.quantity, band)} |")
+    orders = ", ".join(
+        f"in {kind} {part['order']:.1f}" for kind, part in reference["parts"].items() if part.get("order") is not None
+    )
+    failed = sum(bool(row["failure"]) for row in result["settings"])
+    lines += [
+        "",
+        *_prose(
+            f"{len(result['settings'])} settings, {failed} of which failed. The reference: orders "
+            f"{orders or 'not seen'}, band {100 * band:.2g} %. All of it: "
+            f"[{study.name}.json]({plots}/{study.name}.json), [{study.name}.csv]({plots}/{study.name}.csv). "
+            f"{machine['processor']}, {machine['cores']} cores; warpfem "
+            f"{machine['warpfem']}, warp {machine['warp']}."
+        ),
+    ]
+    return lines
+
+
+def _wrapped_command(study: Study) -> list[str]:
+    words = ["warpfem", *(f'"{word}"' if " " in word else word for word in study.command())]
+    lines = textwrap.wrap(" ".join(words), 110, break_long_words=False, break_on_hyphens=False)
+    return [line + (" \\" if line is not lines[-1] else "") for line in lines]
+
+
+def _time(row: dict[str, Any]) -> str:
+    return f"{row['seconds']:.2g} s ({row['seconds_least']:.2g} to {row['seconds_most']:.2g})"
+
+
+def _error(row: dict[str, Any], name: str, band: float) -> str:
+    error = row["errors"][name]
+    return f"{100 * error:.2g} %" if row["resolved"] else f"< {100 * (error + band):.2g} %"
+
+
+def _prose(text: str) -> list[str]:
+    return [*textwrap.wrap(text, 118, break_long_words=False, break_on_hyphens=False), ""]
+
+
+if __name__ == "__main__":
+    main()
