@@ -26,7 +26,8 @@ POLISH = 1e-4
 """Relative residual of the last linear solve of a step that rounding ends."""
 
 STAGNANT_ROUNDINGS = 16.0
-"""Roundings of the force, one for each of the cells about a point, that a residual may hold that no longer falls."""
+"""Roundings of the force, one for each of the cells about a point, that a residual may hold that no longer falls, and
+that the forces of a body may hold that has come to rest."""
 
 FRICTION_UPDATES = 10
 """Newton iterations of a step that take the friction limits of their iterate; later ones keep the last, so that
@@ -234,7 +235,7 @@ class Newton:
     def _rounded(self, report: StepReport, scales: np.ndarray, roundings: np.ndarray) -> StepReport:
         """The end of a step of which rounding hides the rest: good if that is little, or if no force acts at all."""
         model, relative = self.model, report.residual
-        all_is_noise = (scales <= 4.0 * roundings).all()
+        all_is_noise = (scales <= STAGNANT_ROUNDINGS * roundings).all()
         at_rest = all_is_noise and model.dead_load is None and model.contact_energy(self.u) == 0.0
         note = f"resolved only to the rounding of {model.dtype}"
         settled = relative <= SETTLED_LIMIT and self._correction() <= ROUNDING_LIMIT
