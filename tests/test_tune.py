@@ -12,6 +12,7 @@ import pytest
 import warpfem as wf
 from warpfem.cli import FAILED, OK, WRONG_USE, main
 from warpfem.errors import SceneError, SimulationError
+from warpfem.motion import Motion
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import mesh_control
 from warpfem.trade.outcome import Order, Outcome
@@ -387,5 +388,5 @@ def test_what_is_found_is_within_the_error_of_a_finer_run(bar, tmp_path, monkeyp
         settings.choose(tmp_path, bar, {}).scene,
         problem.build(Setting.of(cells=12, **{f"{FORCED}{name}": value for name, value in fine.items()})).scene,
     ]
-    own, exact = (scene.quantities["tip"](wf.Motion.of(wf.Simulation(scene, dtype="float64"))) for scene in scenes)
+    own, exact = (scene.quantities["tip"](Motion.of(wf.Simulation(scene, dtype="float64"))) for scene in scenes)
     assert own == pytest.approx(exact, rel=0.03)
