@@ -324,10 +324,12 @@ def test_failures_are_results(bar, tmp_path):
     }
     body = "".join(f"    if kind == '{name}':\n        {action}\n" for name, action in actions.items())
     bar.write_text(BAR.replace("    mesh =", f"{body}    mesh ="))
-    reasons = {}
+    reasons, by_chance = {}, set()
     for setting in [*(Setting.of(kind=name) for name in actions), Setting.of(solver="velocity_verlet", E=1e7)]:
         order = Order(Problem.of(bar), setting, [np.array([[1.0, 0.5]])], 1, 5.0, "serial")
-        reasons[setting.label] = run_order(order).failure
+        outcome = run_order(order)
+        reasons[setting.label] = outcome.failure
+        by_chance |= {setting.label} if outcome.by_chance else set()
     for name, reason in {
         "kind=die": "killed by SIGKILL",
         "kind=hang": "out of time: more than 5 s",
@@ -336,6 +338,21 @@ def test_failures_are_results(bar, tmp_path):
         "solver=velocity_verlet E=10000000.0": "above the stability limit",
     }.items():
         assert reason in reasons[name]
+    assert by_chance == {"kind=die"}  # the others would fail again
+
+
+def test_only_failures_that_may_go_away_are_run_again(bar, tmp_path, monkeypatch):
+    failures = {"1": Outcome("crashed"), "2": Outcome("killed", by_chance=True), "3": Outcome("late", limit=5.0)}
+    monkeypatch.setattr("warpfem.trade.study.run_order", lambda order: failures[order.setting["cells"]])
+    settings = [Setting.of(cells=cells) for cells in failures]
+    study(bar, tmp_path, Here(), limit=5.0).run(settings)
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    again, longer = Here(), Here()
+    points = study(bar, tmp_path, again, limit=5.0).run(settings)
+    assert again.labels == ["cells=2"]
+    assert [point.failure for point in points] == ["crashed", "", "late"]
+    study(bar, tmp_path, longer, limit=6.0).run(settings)
+    assert longer.labels == ["cells=3"]
 
 
 def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_process):

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import warpfem as wf
 from warpfem.cli import FAILED, OK, WRONG_USE, main
 from warpfem.errors import SceneError, SimulationError
+from warpfem.motion import Motion
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import mesh_control
 from warpfem.trade.outcome import Order, Outcome
@@ -371,3 +373,20 @@ def test_run_and_static_take_settings(bar, settings, tmp_path, capsys):
     assert (summary["steps"], summary["dtype"]) == (3, "float32")
     assert main([*run, "--overwrite", "--json", "--set", "dt=0.05"]) == OK
     assert json.loads(capsys.readouterr().out)["steps"] == 1
+
+
+@pytest.mark.slow
+def test_what_is_found_is_within_the_error_of_a_finer_run(bar, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["tune", str(bar), "--error", "3%", "--quantity", "tip", "--json"]) == OK
+    found = json.loads(capsys.readouterr().out)
+    assert found["estimate"]["error"] + found["estimate"]["band"] <= 0.03
+    problem = Problem.of(bar)
+    settings = SettingsFile.read(tmp_path / "output" / "bar.settings.toml")
+    fine = {"element": "quadratic", "solver": "sdirk2", "dt": "1/160"}
+    scenes = [
+        settings.choose(tmp_path, bar, {}).scene,
+        problem.build(Setting.of(cells=12, **{f"{FORCED}{name}": value for name, value in fine.items()})).scene,
+    ]
+    own, exact = (scene.quantities["tip"](Motion.of(wf.Simulation(scene, dtype="float64"))) for scene in scenes)
+    assert own == pytest.approx(exact, rel=0.03)

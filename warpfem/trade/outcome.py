@@ -44,6 +44,7 @@ class Outcome:
         failure: why there is no result; empty if there is one.
         load: whether other runs of the study ran at the same time.
         limit: the wall time that was not enough, if that is why [s].
+        by_chance: whether the failure is one of the machine, such as a process that was killed.
         seconds: wall time of the steps of each round [s].
         setup_seconds: wall time to build the model, without its kernels [s].
         kernel_seconds: wall time to compile kernels, or to load those compiled before [s].
@@ -65,6 +66,7 @@ class Outcome:
     failure: str = ""
     load: Load = "serial"
     limit: float = 0.0
+    by_chance: bool = False
     seconds: list[float] = field(default_factory=list)
     setup_seconds: float = 0.0
     kernel_seconds: float = 0.0

@@ -54,7 +54,8 @@ def _attempt(order: Order) -> tuple[Outcome, bool]:
                 process_group=0 if os.name == "posix" else None,  # Ctrl-C is for this process to handle
             )
         except OSError as problem:
-            return Outcome(f"no process could be started: {problem}", order.load, machine=facts()), False
+            why = f"no process could be started: {problem}"
+            return Outcome(why, order.load, by_chance=True, machine=facts()), False
         _running.add(process)
         late = threading.Event()
 
@@ -90,7 +91,7 @@ def _attempt(order: Order) -> tuple[Outcome, bool]:
     if late.is_set():
         why = f"out of time: more than {order.seconds:.0f} s"
         return Outcome(why, order.load, limit=order.seconds, machine=facts()), False
-    killed = status == -signal.SIGKILL and not ended
+    killed = status == -signal.SIGKILL
     why = f"was killed by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
     hint = " (out of memory?)" if killed else f": {told[-1]}" if told else ""
-    return Outcome(f"the process {why}{hint}", order.load, machine=facts()), killed
+    return Outcome(f"the process {why}{hint}", order.load, by_chance=killed, machine=facts()), killed and not ended

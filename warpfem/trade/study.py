@@ -167,8 +167,8 @@ class Study:
     def _lacks(self, setting: Setting, count: int) -> bool:
         own = self._own(setting)
         good = sum(not outcome.failure for outcome in own)
-        again = all(not outcome.failure or 0.0 < outcome.limit < self.limit for outcome in own)
-        return good < count and again  # what has failed otherwise would fail again
+        for_good = [o for o in own if o.failure and not o.by_chance and not 0.0 < o.limit < self.limit]
+        return good < count and not for_good
 
     def _run_each(self, settings: Sequence[Setting], rounds: int) -> Iterator[tuple[Setting, Outcome]]:
         """Outcomes as they come; what a lost worker had in hand is submitted again."""
