@@ -1,5 +1,7 @@
 """Settings and fixtures of all tests."""
 
+import signal
+
 import numpy as np
 import pytest
 import warp as wp
@@ -12,3 +14,11 @@ wp.set_device("cpu")
 def rng() -> np.random.Generator:
     """Random numbers, the same in every test."""
     return np.random.default_rng(20)
+
+
+@pytest.fixture
+def interrupts():
+    """Has SIGINT raise KeyboardInterrupt: a background job may have it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -429,6 +429,7 @@ def test_a_study_whose_every_setting_fails_says_so(bar, tmp_path, in_process, ca
     assert "No reference: there is no reference: every setting failed" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("interrupts")
 def test_an_interrupt_ends_the_processes(bar, tmp_path):
     bar.write_text(BAR.replace("    mesh =", "    if kind == 'hang':\n        import time; time.sleep(60)\n    mesh ="))
     start = time.monotonic()

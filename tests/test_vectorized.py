@@ -186,14 +186,6 @@ def test_a_team_runs_all_jobs_and_passes_on_a_failure():
     assert seen[-1] == 3
 
 
-@pytest.fixture
-def interrupts():
-    """Has SIGINT raise KeyboardInterrupt: a background job may have it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize("where", ["while the caller waits", "as news reach the caller"])
 def test_an_interrupted_team_waits_for_all_before_it_tells(where):
