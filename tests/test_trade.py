@@ -235,6 +235,7 @@ def test_the_front_and_its_answers():
     assert one.candidate.seconds == 20.0
     assert one.next_how == "extrapolated"
     assert one.next_seconds > 400.0
+    assert "it is within that, too" in answer(candidates([point(0.001, 3.0)], own, "l2"), own, "l2", 0.1).sentence
     none = answer(ordered, own, "l2", 5e-4)
     assert none.candidate is None
     assert "No setting of the sweep is within 0.05 %" in none.sentence

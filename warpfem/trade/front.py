@@ -26,6 +26,10 @@ LEAST_TAIL = 3
 """Settings of a front, if it has so many, that belong to that part whatever their errors."""
 
 
+DECISIVE = 0.25
+"""The part of the reference's band from which on what leaves it is told as a reason."""
+
+
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A setting with its cost and its error.
@@ -115,7 +119,9 @@ class Answer:
             )
         own = self.candidate
         least, most = own.point.spread
-        if self.next_seconds is not None:
+        if self.next_seconds == own.seconds:
+            price = "it is within that, too"
+        elif self.next_seconds is not None:
             price += f", {self.next_seconds / own.seconds:.2g} times as much"
         return (
             f"The cheapest setting within {asked} is {own.point.setting.label}: {own.seconds:.2g} s ({least:.2g} to "
@@ -152,7 +158,8 @@ def answer(ordered: Sequence[Candidate], reference: Reference, name: str, target
 
 def advice(reference: Reference, name: str) -> str:
     """Why a reference is not more accurate, and what to do."""
-    reasons = [f"in {kind}: {part.remark}" for kind, part in reference.parts[name].items() if part.remark]
+    parts, most = reference.parts[name], DECISIVE * reference.band(name)
+    reasons = [f"in {kind}: {part.remark}" for kind, part in parts.items() if part.remark and part.band >= most]
     reasons += list(dict.fromkeys(reference.remarks))
     text = f"Reasons: {'; '.join(reasons)}. " if reasons else ""
     return (
