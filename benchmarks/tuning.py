@@ -114,7 +114,7 @@ def measure(case: Case, target: float, folder: Path, limit: float, repeats: int)
                 return math.inf
             return relative(difference(point.first, true.first), found.reference.scales)["l2"]
 
-        quick = 4.0 * max(found.point.seconds, 1.0) + 5.0  # what takes longer cannot be the best
+        quick = 2.0 * found.point.seconds + 6.0  # what takes longer cannot be the best
         points = Study(problem, study.store, pool, limit=quick, say=say).run(sweep_settings(case))
         within = sorted((p for p in points if error_of(p) <= target), key=lambda p: p.seconds)
         near = [p.setting for p in within if p.seconds <= 1.5 * within[0].seconds][:4]
