@@ -101,7 +101,7 @@ def jobs(
     """
 
     def job(own: list[wp.Launch], around: AbstractContextManager) -> Job:
-        replays = [each.launch for each in own]
+        replays: list[Callable[[], Any]] = [each.launch for each in own]
         if len(launches) > 1 and own:  # a graph takes Python's lock once, for which threads wait
             with wp.ScopedCapture(device=own[0].device) as capture:
                 for each in own:
