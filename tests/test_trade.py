@@ -42,13 +42,6 @@ def scene(cells: int = 2, E: float = 1e5, dt: float = 1 / 40, kind: str = "soft"
 
 
 @pytest.fixture
-def bar(tmp_path) -> Path:
-    path = tmp_path / "bar.py"
-    path.write_text(BAR)
-    return path
-
-
-@pytest.fixture
 def in_process(monkeypatch):
     """Settings run in this process, which is quicker."""
     monkeypatch.setattr("warpfem.trade.study.run_order", measure)
