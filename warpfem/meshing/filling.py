@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import os
+import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,6 +20,11 @@ from warpfem.meshing.waiting import telling_time
 
 MAX_CLOSED_AREA_RATIO = 1.1
 """A mesh whose boundary is larger than the given surface by more than this had holes to close."""
+
+MAX_LOST_SHARE = 0.01
+"""If more of the surface than this is away from the mesh, parts of the body are missing."""
+
+_SAMPLES = 200
 
 
 def tetrahedralize(
@@ -42,8 +48,9 @@ def tetrahedralize(
         triangles: (k, 3) point indices.
         edge_length: edge length to aim for [m], > 0, at most the diagonal of the bounding box; where the
             surface has finer detail, edges are shorter. ``None`` takes a twentieth of that diagonal.
-        envelope: largest distance of the mesh from the surface [m], > 0, at most the edge length; small ones follow
-            fine detail by small cells, large ones smooth it away. ``None`` takes a tenth of the edge length.
+        envelope: largest distance of the mesh from the surface [m], > 0, at most the edge length. Small ones follow
+            fine detail by small cells, large ones smooth it away, and parts that are thinner vanish. ``None`` takes a
+            tenth of the edge length, or for thin bodies less.
         progress: tell on the standard error how long it takes, if that is a terminal.
 
     Returns:
@@ -57,7 +64,8 @@ def tetrahedralize(
     points, triangles = checked_surface(points, triangles)
     corners = points[triangles]
     area_vectors = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(area_vectors, axis=1).sum()
+    areas = np.linalg.norm(area_vectors, axis=1)
+    area = areas.sum()
     lower = corners.min(axis=(0, 1))
     diagonal = float(np.linalg.norm(corners.max(axis=(0, 1)) - lower))
     spread = np.linalg.eigvalsh(np.cov(corners.reshape(-1, 3).T))  # squares of the extents
@@ -71,7 +79,9 @@ def tetrahedralize(
             f"{diagonal:g} m, not {edge_length!r}"
         )
     if envelope is None:
-        envelope = edge_length / 10.0
+        # volume by the divergence theorem; where parts of the surface are turned round it is too small
+        half_thickness = abs(np.linalg.det(corners - lower).sum()) / 6.0 / area
+        envelope = min(edge_length / 10.0, max(half_thickness / 2.0, diagonal / 1000.0))
     if not is_number(envelope) or not 0.0 < envelope <= edge_length:
         raise MeshError(f"envelope must be above 0 and at most the edge length, {edge_length:g} m, not {envelope!r}")
 
@@ -91,6 +101,13 @@ def tetrahedralize(
     if ratio > MAX_CLOSED_AREA_RATIO:
         raise MeshError(
             f"the surface is open: closing it took {ratio - 1.0:.0%} more area than it has; close its holes"
+        )
+    lost = _lost_share(mesh, corners, areas, envelope)
+    if lost > MAX_LOST_SHARE:
+        warnings.warn(
+            f"{lost:.0%} of the surface is not near the mesh: parts thinner than the envelope, {envelope:g} m, vanish; "
+            "give a smaller envelope if they matter",
+            stacklevel=2,
         )
     return mesh
 
@@ -134,6 +151,17 @@ def _filled(problem: dict[str, np.ndarray], progress: bool) -> tuple[np.ndarray,
                 f"fTetWild could not fill the surface ({error}): try another edge_length or envelope"
             ) from error
     return cache.keep(key, *made)
+
+
+def _lost_share(mesh: Mesh, corners: np.ndarray, areas: np.ndarray, envelope: float) -> float:
+    """The share of a surface's area that is farther from the mesh than some envelopes, by samples."""
+    ends = np.cumsum(areas)
+    chosen = np.searchsorted(ends, ends[-1] * (np.arange(_SAMPLES) + 0.5) / _SAMPLES)
+    samples = corners[chosen].mean(axis=1)
+    cells = mesh.points[mesh.corners]
+    lower, upper = cells.min(axis=1) - 3.0 * envelope, cells.max(axis=1) + 3.0 * envelope
+    near = [((lower <= sample) & (sample <= upper)).all(axis=1).any() for sample in samples]
+    return 1.0 - float(np.mean(near))
 
 
 def fill(path: str) -> tuple[np.ndarray, np.ndarray]:
