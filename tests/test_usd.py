@@ -27,8 +27,8 @@ from warpfem.usd import (
     UsdWriter,
     animation,
     read_animation,
+    read_mesh,
     read_surface_mesh,
-    read_tet_mesh,
 )
 
 REPOSITORY = Path(__file__).parent.parent
@@ -405,7 +405,8 @@ def test_no_frames_leave_the_rest_shape(tmp_path: Path) -> None:
     assert_sound(tmp_path / "run.partial.usda", 0)
     assert writer.close() == writer.close() == tmp_path / "run.usdc"
     assert_sound(tmp_path / "run.usdc", 0)
-    points, cells = read_tet_mesh(tmp_path / "run.usdc")
+    read = read_mesh(tmp_path / "run.usdc")
+    points, cells = read.points, read.cells
     assert points == pytest.approx(body.rest_points, abs=1e-7) and np.array_equal(cells, body.cells)
 
 
@@ -872,7 +873,8 @@ def author_tets(path: Path, cells, *, meters_per_unit=None, orientation="rightHa
 @pytest.mark.parametrize(("authored", "unit"), [(None, 1.0), (1.0, 1.0), (0.01, 0.01)])
 def test_tet_meshes_come_in_metres_and_in_the_world(tmp_path: Path, authored, unit: float) -> None:
     author_tets(tmp_path / "a.usda", [(0, 1, 2, 3)], meters_per_unit=authored, scale=(2, 3, 4)).Save()
-    points, cells = read_tet_mesh(tmp_path / "a.usda")
+    read = read_mesh(tmp_path / "a.usda")
+    points, cells = read.points, read.cells
     assert (points.dtype, cells.dtype) == (np.float64, np.int32)
     assert points == pytest.approx(unit * (TETRAHEDRON * (2, 3, 4) + (10, 0, 0)), rel=1e-12)
     assert cells.tolist() == [[0, 1, 2, 3]]
@@ -882,8 +884,8 @@ def test_tet_meshes_come_in_metres_and_in_the_world(tmp_path: Path, authored, un
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_tet_meshes_come_with_positive_volumes(tmp_path: Path, orientation: str, cell, mirror: int) -> None:
     author_tets(tmp_path / "a.usda", [cell], orientation=orientation, scale=(mirror, 1, 1)).Save()
-    points, cells = read_tet_mesh(tmp_path / "a.usda")
-    a, b, c, d = points[cells[0]]
+    read = read_mesh(tmp_path / "a.usda")
+    a, b, c, d = read.points[read.cells[0]]
     assert np.linalg.det([b - a, c - a, d - a]) == pytest.approx(1.0)
 
 
@@ -894,7 +896,7 @@ def test_a_tet_mesh_with_only_samples_is_read_at_the_first(tmp_path: Path) -> No
     for code in (7.0, 3.0):
         attr.Set(Vt.Vec3fArray.FromNumpy(TETRAHEDRON * np.float32(code)), code)
     stage.Save()
-    assert read_tet_mesh(tmp_path / "a.usda")[0] == pytest.approx(3.0 * TETRAHEDRON + (10, 0, 0))
+    assert read_mesh(tmp_path / "a.usda").points == pytest.approx(3.0 * TETRAHEDRON + (10, 0, 0))
 
 
 def test_surfaces_are_merged_and_cut_into_triangles(tmp_path: Path) -> None:
@@ -910,7 +912,8 @@ def test_surfaces_are_merged_and_cut_into_triangles(tmp_path: Path) -> None:
         if name == "hidden":
             mesh.CreatePurposeAttr("guide")
     stage.Save()
-    points, triangles = read_surface_mesh(path)
+    read = read_surface_mesh(path)
+    points, triangles = read.points, read.triangles
     assert points[:, 2].tolist() == [0.0] * 5 + [1.0] * 5
     fan = [[0, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3, 4]]
     assert triangles[:4].tolist() == fan
@@ -920,7 +923,8 @@ def test_surfaces_are_merged_and_cut_into_triangles(tmp_path: Path) -> None:
 
 def test_the_bear_that_comes_with_warp_is_closed_and_outward() -> None:
     examples = pytest.importorskip("warp.examples")
-    points, triangles = read_surface_mesh(Path(examples.get_asset_directory()) / "bear.usd")
+    read = read_surface_mesh(Path(examples.get_asset_directory()) / "bear.usd")
+    points, triangles = read.points, read.triangles
     assert (points.shape, triangles.shape) == ((1986, 3), (3968, 3))
     assert np.ptp(points, axis=0) == pytest.approx((4.89, 5.542, 9.78), abs=1e-3)
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
@@ -929,7 +933,7 @@ def test_the_bear_that_comes_with_warp_is_closed_and_outward() -> None:
     assert len(edges) == 3 * 3968 and all((end, start) in edges for start, end in edges)
 
 
-@pytest.mark.parametrize("read", [read_tet_mesh, read_surface_mesh])
+@pytest.mark.parametrize("read", [read_mesh, read_surface_mesh])
 def test_unreadable_meshes_are_errors(tmp_path: Path, read) -> None:
     write(tmp_path / "run.usdc", [make_body(3)], 1)
     whole = (tmp_path / "run.usdc").read_bytes()
@@ -953,13 +957,13 @@ def test_unreadable_meshes_are_errors(tmp_path: Path, read) -> None:
 def test_meshes_that_make_no_sense_are_errors(tmp_path: Path) -> None:
     author_tets(tmp_path / "range.usda", [(0, 1, 2, 3), (0, 1, 2, 4)]).Save()
     with pytest.raises(MeshError, match="1 indices are outside of its 4 points, the first one is 4 at position 7"):
-        read_tet_mesh(tmp_path / "range.usda")
+        read_mesh(tmp_path / "range.usda")
     author_tets(tmp_path / "empty.usda", np.empty((0, 4))).Save()
     with pytest.raises(MeshError, match="/root/tets: the mesh is empty"):
-        read_tet_mesh(tmp_path / "empty.usda")
+        read_mesh(tmp_path / "empty.usda")
     write(tmp_path / "two.usdc", [make_body(3, "a"), make_body(3, "b")], 0)
     with pytest.raises(MeshError, match="/World/a/simulation, /World/b/simulation"):
-        read_tet_mesh(tmp_path / "two.usdc")
+        read_mesh(tmp_path / "two.usdc")
 
     stage = Usd.Stage.CreateNew(str(tmp_path / "counts.usda"))
     mesh = UsdGeom.Mesh.Define(stage, "/mesh")

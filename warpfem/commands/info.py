@@ -12,6 +12,7 @@ from warpfem.commands.session import OK, start_warp
 
 EXTRAS = {
     "meshio": "mesh",
+    "trimesh": "mesh",
     "pytetwild": "tet",
     "matplotlib": "plot",
     "pillow": "plot",

@@ -1,7 +1,7 @@
 """Animations and meshes in USD: the only part of warpfem that imports ``pxr``.
 
 :class:`UsdWriter` stores a run frame by frame, in a thread as a :class:`BackgroundWriter`;
-:func:`read_animation` reads it back, and :func:`read_tet_mesh` and :func:`read_surface_mesh` take meshes
+:func:`read_animation` reads it back, and :func:`read_mesh` and :func:`read_surface_mesh` take meshes
 from files that others made. All of them speak numpy; none knows of Warp, models or solvers.
 """
 
@@ -9,7 +9,7 @@ from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_a
 from warpfem.usd.background import BackgroundWriter
 from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale
-from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
+from warpfem.usd.meshes import read_mesh, read_surface_mesh
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter, check_path
 
@@ -26,6 +26,6 @@ __all__ = [
     "check_path",
     "partial_path",
     "read_animation",
+    "read_mesh",
     "read_surface_mesh",
-    "read_tet_mesh",
 ]
