@@ -546,15 +546,16 @@ class Model:
         for block in self.blocks:
             block.vectorize(self.rest_points, least, self.team)
 
-    def describe_forces(self) -> str:
-        """How :meth:`add_internal_force` computes them, and on how many threads."""
+    def describe_forces(self, threads: int | None = None) -> str:
+        """How :meth:`add_internal_force` computes them, and on how many threads, if not on the whole team."""
         count = sum(block.count for block in self.blocks if block.vectorized)
         if not count:
             return "one cell at a time, on one thread"
         plain = self.cell_count - count
         others = f", {plain} others one at a time" if plain else ""
-        threads = "1 thread" if self.team.size == 1 else f"{self.team.size} threads"
-        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
+        size = threads or self.team.size
+        team = "1 thread" if size == 1 else f"{size} threads"
+        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {team}"
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""
