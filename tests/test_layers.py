@@ -33,7 +33,7 @@ LAYERS = [
     {"linear", "reactions"},
     {"solvers"},
     {"simulation"},
-    {"usd", "checkpoint", "failure", "motion"},
+    {"usd", "checkpoint", "failure", "motion", "interop"},
     {"record", "explain", "scene_file", "preview"},
     {"static_run"},
     {"extremes", "trade"},
@@ -101,4 +101,6 @@ def test_optional_packages_are_imported_where_they_are_used(path):
         "pyamg",
         "pypardiso",
         "distributed",
+        "torch",
+        "jax",
     }

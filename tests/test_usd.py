@@ -20,6 +20,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdValidation, Vt
 from warpfem.boundary import BoxWalls, Plane, Sphere
 from warpfem.errors import MeshError, OutputError
 from warpfem.mesh import Mesh
+from warpfem.meshing import read_mesh
 from warpfem.usd import (
     BodyFrame,
     ColorScale,
@@ -292,6 +293,14 @@ def test_read_animation_gives_back_what_was_written(tmp_path: Path, dim: int) ->
     for index in (-1, 4):
         with pytest.raises(IndexError):
             animation.frame(index)
+
+
+def test_an_output_is_a_mesh_again(tmp_path: Path) -> None:
+    body = make_body(3)
+    write(tmp_path / "run.usdc", [body], 2, obstacles=OBSTACLES[3])
+    mesh = read_mesh(tmp_path / "run.usdc")
+    assert np.array_equal(mesh.cells, body.cells)
+    assert np.array_equal(mesh.points, body.rest_points.astype(np.float32))
 
 
 @pytest.mark.parametrize("dim", SETUPS)
