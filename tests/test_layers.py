@@ -95,6 +95,7 @@ def test_optional_packages_are_imported_where_they_are_used(path):
         "pytetwild",
         "matplotlib",
         "PIL",
+        "imageio_ffmpeg",
         "tqdm",
         "trimesh",
         "scipy",
