@@ -289,7 +289,6 @@ def test_read_animation_gives_back_what_was_written(tmp_path: Path, dim: int) ->
             assert np.array_equal(frame.points, lifted(frames[index][number].points).astype(np.float32))
             assert frame.von_mises == pytest.approx(frames[index][number].von_mises, rel=1e-6)
             assert frame.jacobian == pytest.approx(frames[index][number].jacobian, rel=1e-6)
-            assert frame.colors.shape == frame.points.shape
     for index in (-1, 4):
         with pytest.raises(IndexError):
             animation.frame(index)
@@ -301,6 +300,48 @@ def test_an_output_is_a_mesh_again(tmp_path: Path) -> None:
     mesh = read_mesh(tmp_path / "run.usdc")
     assert np.array_equal(mesh.cells, body.cells)
     assert np.array_equal(mesh.points, body.rest_points.astype(np.float32))
+
+
+@pytest.mark.parametrize("dim", SETUPS)
+def test_scalars_of_a_surface_are_read_at_the_corners_of_its_faces(tmp_path: Path, dim: int) -> None:
+    body = make_body(dim)
+    write(tmp_path / "run.usdc", [body], 2)
+    stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
+    surface = UsdGeom.Mesh.Get(stage, "/World/block/block_surface")
+    faces = np.array(surface.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    point_count = len(surface.GetPointsAttr().Get(0))
+    primvars, tokens = UsdGeom.PrimvarsAPI(surface), UsdGeom.Tokens
+    expected = {}
+    for interpolation, count, pick in (
+        (tokens.constant, 1, lambda values: np.full(faces.shape, values[0])),
+        (tokens.uniform, len(faces), lambda values: np.repeat(values[:, None], 3, axis=1)),
+        (tokens.vertex, point_count, lambda values: values[faces]),
+        (tokens.varying, point_count, lambda values: values[faces]),
+        (tokens.faceVarying, faces.size, lambda values: values.reshape(faces.shape)),
+    ):
+        name = f"by_{interpolation}"
+        primvar = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.DoubleArray, interpolation)
+        for index in range(2):
+            primvar.Set(np.arange(count) + 0.5 + index, index)
+        expected[name] = pick(np.arange(count) + 0.5)
+    indexed = primvars.CreatePrimvar("indexed", Sdf.ValueTypeNames.HalfArray, tokens.uniform)
+    indexed.Set([3.0, 4.0])
+    indexed.SetIndices([face % 2 for face in range(len(faces))])
+    short = primvars.CreatePrimvar("short", Sdf.ValueTypeNames.IntArray, tokens.vertex)
+    short.Set([1, 2])
+    stage.Save()
+    animation = read_animation(tmp_path / "run.usdc")
+    assert set(animation.primvars) == {*expected, "indexed", "short", "J", "JPoint", "vonMises", "vonMisesPoint"}
+    for index in range(2):
+        for name, values in expected.items():
+            (read,) = animation.surface_values(name, index)
+            assert np.array_equal(read, values + index), name
+        (read,) = animation.surface_values("indexed", index)
+        assert np.array_equal(read[:, 0], 3.0 + np.arange(len(faces)) % 2)
+    with pytest.raises(
+        OutputError, match="lacks primvars:short of /World/block/block_surface at 0, one number for each"
+    ):
+        animation.surface_values("short", 0)
 
 
 @pytest.mark.parametrize("dim", SETUPS)

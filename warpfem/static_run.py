@@ -196,6 +196,7 @@ def record_static(run: StaticRun, path: str | Path) -> Generator[Frame, None, No
         up_axis=scene.up_axis,
         obstacles=scene.obstacles,
         color_by=scene.color_by,
+        equilibria=True,
         comment=f"warpfem {__version__}",
     ) as writer:
         for frame in chain(first, frames):

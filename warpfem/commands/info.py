@@ -16,6 +16,7 @@ EXTRAS = {
     "pytetwild": "tet",
     "matplotlib": "plot",
     "pillow": "plot",
+    "imageio-ffmpeg": "video",
     "tqdm": "progress",
     "scipy": "bench",
     "scikit-fem": "bench",

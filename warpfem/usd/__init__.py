@@ -8,7 +8,7 @@ from files that others made. All of them speak numpy; none knows of Warp, models
 from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_animation
 from warpfem.usd.background import BackgroundWriter
 from warpfem.usd.bodies import BodyFrame, UsdBody
-from warpfem.usd.colors import ColorQuantity, ColorScale
+from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.meshes import read_mesh, read_surface_mesh
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter, check_path
@@ -28,4 +28,5 @@ __all__ = [
     "read_animation",
     "read_mesh",
     "read_surface_mesh",
+    "spread_of",
 ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from pxr import Gf, Sdf, Usd
 
 from warpfem.boundary import Obstacle
 from warpfem.errors import OutputError
-from warpfem.files import beside
+from warpfem.files import beside, existing_folder, require_writable
 from warpfem.usd.bodies import BodyFrame, UsdBody, in_space
 from warpfem.usd.chunks import ChunkedLayer, Samples
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
@@ -63,6 +62,7 @@ class UsdWriter:
         color_by: ColorQuantity = "von_mises",
         color_range: tuple[float, float] | None = None,
         frames_per_chunk: int = 8,
+        equilibria: bool = False,
         comment: str = "",
         keep: tuple[int, Sequence[BodyFrame]] | None = None,
         expected_frames: int = 0,
@@ -79,6 +79,7 @@ class UsdWriter:
             color_range: values of the first and last colour; ``None``: 0..s for von Mises, 1 - s..1 + s for
                 J, with s such that at most 0.5 % of a body's surface points are beyond in any frame.
             frames_per_chunk: the most frames that wait in memory to be saved.
+            equilibria: frames are equilibria on the way to the full load, and not moments in time.
             comment: stored in the file as its comment.
             keep: the last of the frames to keep that an earlier writer of the same ``path`` left, in its
                 partial file or in ``path`` itself: its index, and what it holds, to know it by. Later frames
@@ -92,6 +93,7 @@ class UsdWriter:
         self.path = Path(path)
         _check_settings(self.path, bodies, fps, up_axis, color_by, color_range, frames_per_chunk)
         self._quantity: ColorQuantity = color_by
+        self._equilibria = equilibria
         self._fixed_range = color_range
         self._spread = 0.0
         self._closed = False
@@ -202,7 +204,7 @@ class UsdWriter:
 
     def _check_room(self, rest: Samples, frame_count: int) -> None:
         """The partial file and the merged one are on the disk together at the end."""
-        folder = _existing_folder(self.path)
+        folder = existing_folder(self.path)
         frame_bytes = sum(np.asarray(value).nbytes for value in rest.values())
         old = [path for path in beside(self.path, "partial").glob("*") if path.is_file()]
         free = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in old)
@@ -223,7 +225,8 @@ class UsdWriter:
     def _metadata(self) -> dict[str, Any]:
         scale = self._scale
         primvar, limits = POINT_PRIMVARS[scale.quantity], Gf.Vec2d(scale.lower, scale.upper)
-        return {"warpfem": {"colorBy": scale.quantity, "colorPrimvar": primvar, "colorRange": limits}}
+        stated = {"colorBy": scale.quantity, "colorPrimvar": primvar, "colorRange": limits}
+        return {"warpfem": stated | ({"equilibria": True} if self._equilibria else {})}
 
     def _samples(self, frames: Sequence[BodyFrame], where: str) -> Samples:
         samples: Samples = {}
@@ -256,16 +259,12 @@ def check_path(path: str | Path) -> None:
     odd = _odd_part(path)
     if odd:
         raise OutputError(f"{str(path)!r} cannot be written: USD does not bear {odd} in the name of a file")
-    with reporting(f"{path} cannot be written", OutputError):
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            beside(path, "writing.checkpoint.npz").stat()  # as long as the longest name beside it
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder: give the name of a file")
-        if path.exists() and not os.access(path, os.W_OK):
-            raise OutputError(f"{path} cannot be written: it is write-protected")
-        folder = _existing_folder(path)
-        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-            raise OutputError(f"{path} cannot be written: {folder} is not a folder that can be written to")
+    with (
+        reporting(f"{path} cannot be written", OutputError),
+        contextlib.suppress(FileNotFoundError, NotADirectoryError),
+    ):
+        beside(path, "writing.checkpoint.npz").stat()  # as long as the longest name beside it
+    require_writable(path)
 
 
 def _odd_part(path: Path) -> str:
@@ -278,14 +277,6 @@ def _odd_part(path: Path) -> str:
     odd = [text for text in ("\0", "\\", ":SDF_FORMAT_ARGS:") if text in whole]
     odd += [character for character in path.name if ord(character) < 32 or ord(character) == 127]
     return repr(odd[0]) if odd else ""
-
-
-def _existing_folder(path: Path) -> Path:
-    """The folder of a path, or the one that it will be made in."""
-    folder = path.absolute().parent
-    while not folder.exists():
-        folder = folder.parent
-    return folder
 
 
 def _size(byte_count: float) -> str:
