@@ -34,6 +34,7 @@ LAYERS = [
     {"solvers"},
     {"simulation"},
     {"usd", "checkpoint", "failure", "motion"},
+    {"stage"},
     {"record", "explain", "scene_file", "preview"},
     {"static_run"},
     {"extremes", "trade"},

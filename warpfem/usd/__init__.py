@@ -10,6 +10,7 @@ from warpfem.usd.background import BackgroundWriter
 from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
+from warpfem.usd.physics.reader import read_stage_scene
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter, check_path
 
@@ -26,6 +27,7 @@ __all__ = [
     "check_path",
     "partial_path",
     "read_animation",
+    "read_stage_scene",
     "read_surface_mesh",
     "read_tet_mesh",
 ]
