@@ -664,7 +664,7 @@ def test_a_disk_without_room_is_said_at_once(tmp_path: Path, monkeypatch) -> Non
     left.write_frame([make_frame(body, 0)])
     before = {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()}
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr("warpfem.usd.writer.shutil.disk_usage", lambda folder: usage._replace(free=int(0.7 * needed)))
+    monkeypatch.setattr("warpfem.usd.frames.shutil.disk_usage", lambda folder: usage._replace(free=int(0.7 * needed)))
     with pytest.raises(OutputError, match=r"its 40 frames need \d[\d.]* MB .* has \d[\d.]* MB free: take another"):
         UsdWriter(path, [body], fps=24, expected_frames=40)
     assert {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()} == before

@@ -207,11 +207,16 @@ class Box(_Obstacle):
         dim = len(self.center)
         if len(self.size) != dim or min(self.size) <= 0.0:
             raise SceneError(f"Box: size {self.size} must be {dim} numbers above 0, one for each of center")
-        axes = np.eye(dim) if self.axes is None else np.array([_vector("Box", "axes", axis) for axis in self.axes])
-        lengths = np.linalg.norm(axes, axis=-1, keepdims=True)
-        if axes.shape != (dim, dim) or not lengths.all() or np.abs(axes @ axes.T / (lengths @ lengths.T) - np.eye(dim)).max() > PERPENDICULAR:
-            raise SceneError(f"Box: axes must be {dim} directions that are perpendicular to each other, not {self.axes!r}")
-        object.__setattr__(self, "axes", tuple(map(tuple, (axes / lengths).tolist())))
+        given = np.eye(dim).tolist() if self.axes is None else self.axes
+        rows = [_vector("Box", "axes", axis) for axis in given] if isinstance(given, Sequence | np.ndarray) else []
+        axes = np.array(
+            [np.array(row) / max(np.linalg.norm(row), np.finfo(float).tiny) for row in rows if len(row) == dim]
+        )
+        if len(rows) != dim or axes.shape != (dim, dim) or np.abs(axes @ axes.T - np.eye(dim)).max() > PERPENDICULAR:
+            raise SceneError(
+                f"Box: axes must be {dim} directions that are perpendicular to each other, not {self.axes!r}"
+            )
+        object.__setattr__(self, "axes", tuple(map(tuple, axes.tolist())))
 
     @property
     def shape(self) -> np.ndarray:

@@ -53,7 +53,6 @@ def read_stage(path: str | Path, dt: float = STEP) -> Scene:
 
     stage = read_stage_scene(path)
     bodies = [_body(str(path), body) for body in stage.bodies]
-    settings = {} if stage.frames is None else {"frames": stage.frames}
     return Scene(
         bodies,
         BackwardEuler(),
@@ -62,8 +61,8 @@ def read_stage(path: str | Path, dt: float = STEP) -> Scene:
         obstacles=stage.obstacles,
         damping=stage.damping,
         fps=stage.fps,
+        frames=Scene.frames if stage.frames is None else stage.frames,
         up_axis="Y" if stage.up_axis == "Y" else "Z",
-        **settings,
     )
 
 

@@ -9,10 +9,11 @@ from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_a
 from warpfem.usd.background import BackgroundWriter
 from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale
+from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
 from warpfem.usd.physics.reader import read_stage_scene
 from warpfem.usd.saved import partial_path
-from warpfem.usd.writer import UsdWriter, check_path
+from warpfem.usd.writer import UsdWriter
 
 __all__ = [
     "AnimatedBody",
@@ -22,6 +23,7 @@ __all__ = [
     "BodyFrame",
     "ColorQuantity",
     "ColorScale",
+    "FrameWriter",
     "UsdBody",
     "UsdWriter",
     "check_path",

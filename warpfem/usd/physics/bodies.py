@@ -79,7 +79,8 @@ def _body(view: StageView, prim: Usd.Prim, owner: Usd.Prim, name: str, pins: np.
     bad = np.flatnonzero(((cells < 0) | (cells >= count)).any(axis=1))
     if len(bad):
         raise view.error(
-            prim, f"{len(bad)} of its {len(cells)} tetrahedra refer to points that it has not, the first one is {bad[0]}"
+            prim,
+            f"{len(bad)} of its {len(cells)} tetrahedra refer to points that it has not, the first one is {bad[0]}",
         )
     used, own_cells = np.unique(cells, return_inverse=True)
     rest = _rest_points(view, prim, cells, place.points)
@@ -263,11 +264,11 @@ def _follower(view: StageView, prim: Usd.Prim) -> Follower:
     if normals is None or len(normals) == 0:
         return Follower(place, bind_points)
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(view.start) or Vt.IntArray(), np.int32)
-    points = {
-        "vertex": np.arange(len(place.points)),
-        "varying": np.arange(len(place.points)),
-        "faceVarying": corners,
-    }.get(mesh.GetNormalsInterpolation(), np.zeros(0, np.int32))
+    interpolation, points = mesh.GetNormalsInterpolation(), np.zeros(0, np.int32)
+    if interpolation in ("vertex", "varying"):
+        points = np.arange(len(place.points), dtype=np.int32)
+    elif interpolation == "faceVarying":
+        points = corners
     if len(points) != len(normals) or (len(points) and not 0 <= points.min() <= points.max() < len(place.points)):
         view.warn(prim, "its normals stay as they are while it is deformed: they are not one per point or corner")
         return Follower(place, bind_points)

@@ -42,12 +42,17 @@ def read_obstacles(view: StageView, deformable: Collection[str]) -> tuple[Obstac
     return tuple(obstacles)
 
 
+def is_free(view: StageView, body: Usd.Prim) -> bool:
+    """Whether a rigid body moves freely, rather than standing still or being moved."""
+    enabled = view.switch(body, "physics:rigidBodyEnabled", True)
+    return enabled and not view.switch(body, "physics:kinematicEnabled", False)
+
+
 def _reason_to_skip(view: StageView, prim: Usd.Prim) -> str:
     above = prim
     while above and not above.IsPseudoRoot():
         if above.HasAPI(UsdPhysics.RigidBodyAPI):
-            moves = view.switch(above, "physics:rigidBodyEnabled", True)
-            if moves and not view.switch(above, "physics:kinematicEnabled", False):
+            if is_free(view, above):
                 return f"{above.GetPath()} is a rigid body that moves freely, which warpfem does not simulate"
             return ""
         above = above.GetParent()
@@ -56,10 +61,10 @@ def _reason_to_skip(view: StageView, prim: Usd.Prim) -> str:
 
 def _obstacle(view: StageView, prim: Usd.Prim) -> Obstacle | None:
     matrix = view.to_world(prim)
-    linear, origin = matrix[:3, :3], matrix[3, :3]
+    linear, origin = matrix[:3, :3], matrix[3, :3].tolist()
     if prim.IsA(UsdGeom.Plane):
         axis = np.eye(3)["XYZ".index(UsdGeom.Plane(prim).GetAxisAttr().Get(view.start))]
-        return Plane(origin, np.linalg.inv(linear) @ axis, _friction(view, prim))
+        return Plane(origin, (np.linalg.inv(linear) @ axis).tolist(), _friction(view, prim))
     scales = np.linalg.norm(linear, axis=1)
     edges = linear / scales[:, None]
     if np.abs(edges @ edges.T - np.eye(3)).max() > _ROUNDING:
@@ -68,7 +73,7 @@ def _obstacle(view: StageView, prim: Usd.Prim) -> Obstacle | None:
         return Sphere(origin, UsdGeom.Sphere(prim).GetRadiusAttr().Get(view.start) * scales[0], _friction(view, prim))
     if prim.IsA(UsdGeom.Cube):
         size = UsdGeom.Cube(prim).GetSizeAttr().Get(view.start) * scales
-        return Box(origin, size, edges, _friction(view, prim))
+        return Box(origin, size.tolist(), edges.tolist(), _friction(view, prim))
     return None
 
 

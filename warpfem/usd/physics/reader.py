@@ -14,7 +14,7 @@ from warpfem.errors import SceneError, one_line
 from warpfem.usd.physics import tokens
 from warpfem.usd.physics.attachments import read_pins
 from warpfem.usd.physics.bodies import body_prim, governed, read_bodies
-from warpfem.usd.physics.colliders import read_obstacles
+from warpfem.usd.physics.colliders import is_free, read_obstacles
 from warpfem.usd.physics.data import StageScene
 from warpfem.usd.physics.view import StageView, applied
 from warpfem.usd.stages import open_stage, reporting
@@ -32,7 +32,7 @@ _UNDERSTOOD = {
     "PhysicsCollisionAPI",
     "PhysicsMeshCollisionAPI",  # says how to approximate a collider, of which there is a warning of its own
     "PhysicsMaterialAPI",
-    "PhysicsRigidBodyAPI",  # likewise
+    "PhysicsRigidBodyAPI",  # of one that moves freely
 }
 
 _MOST_WARNINGS = 20
@@ -88,10 +88,10 @@ def _gravity(view: StageView) -> tuple[tuple[float, float, float] | None, float]
     magnitude, direction, damping = tokens.EARTH, down, 0.0
     if scenes:
         own = UsdPhysics.Scene(scenes[0])
-        given = float(own.GetGravityMagnitudeAttr().Get(view.start))
-        if math.isfinite(given) and given >= 0.0:
+        given = view.number(scenes[0], "physics:gravityMagnitude")
+        if given is not None and given >= 0.0:  # what is below stands for that of the earth
             magnitude = given * view.length
-        elif given != -math.inf and not given < 0.0:
+        if not math.isfinite(magnitude) or given != given:
             raise view.error(scenes[0], f"physics:gravityMagnitude must be a finite number, not {given}")
         stated = np.array(own.GetGravityDirectionAttr().Get(view.start), float)
         if not np.isfinite(stated).all():
@@ -138,6 +138,8 @@ def _warn_of_the_unknown(view: StageView) -> None:
     for prim in view.prims:
         names = [str(prim.GetTypeName()), *(name.partition(":")[0] for name in applied(prim))]
         strange = [name for name in names if name.startswith(_PHYSICS) and name not in _UNDERSTOOD]
+        if prim.HasAPI(UsdPhysics.RigidBodyAPI) and is_free(view, prim):
+            strange.append("PhysicsRigidBodyAPI")
         if strange:
             unknown.append((prim, ", ".join(dict.fromkeys(strange))))
     for prim, names_of_it in unknown[:_MOST_WARNINGS]:

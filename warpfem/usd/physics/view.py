@@ -71,7 +71,7 @@ class StageView:
         return attribute.Get(self.start) if attribute and attribute.HasAuthoredValue() else None
 
     def number(self, prim: Usd.Prim, name: str) -> float | None:
-        """An authored number.
+        """An authored number: the shortest of those that the file's float32 stands for.
 
         Raises:
             SceneError: it is none.
@@ -81,7 +81,8 @@ class StageView:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.error(prim, f"{name} must be a number, not {value!r}")
-        return float(value)
+        is_single = prim.GetAttribute(name).GetTypeName() == Sdf.ValueTypeNames.Float
+        return float(str(np.float32(value))) if is_single else float(value)
 
     def switch(self, prim: Usd.Prim, name: str, default: bool) -> bool:
         """An authored yes or no."""
