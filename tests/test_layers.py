@@ -26,7 +26,7 @@ LAYERS = [
     {"materials"},
     {"stiffness"},
     {"elements", "meshing", "folds", "patches", "patch_kernels", "places"},
-    {"scene"},
+    {"scene", "embedding"},
     {"supports", "contact"},
     {"model"},
     {"averaged", "vectorized"},

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpfem.boundary import Pin
-from warpfem.errors import SceneError, WarpfemError
+from warpfem.errors import WarpfemError
 from warpfem.materials import MATERIALS, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.scene import Body, Scene
@@ -89,9 +89,3 @@ def _naming(where: str) -> Iterator[None]:
         yield
     except WarpfemError as error:
         raise type(error)(f"{where}: {error}") from error
-
-
-def require_other_file(path: Path, out: Path) -> None:
-    """Raises SceneError if a run of a stage would replace the stage itself."""
-    if out.exists() and path.exists() and out.samefile(path):
-        raise SceneError(f"{out} is the stage that is to be simulated: take another output")

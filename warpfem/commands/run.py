@@ -17,9 +17,10 @@ from warpfem.checkpoint import Checkpoint, checkpoint_path
 from warpfem.commands.options import load, positive, scene_options, time_options
 from warpfem.commands.output import kept, require_consent
 from warpfem.commands.session import FAILED, OK, fail, held_interrupt, start_warp
-from warpfem.errors import SimulationError, WarpfemError
+from warpfem.errors import OutputError, SimulationError, WarpfemError
 from warpfem.record import record
 from warpfem.simulation import Frame, Simulation, Summary
+from warpfem.stage import SUFFIXES
 
 
 def add(commands: Any) -> None:
@@ -28,6 +29,11 @@ def add(commands: Any) -> None:
     scene_options(run)
     time_options(run)
     run.add_argument("--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.usdc)")
+    run.add_argument(
+        "--over",
+        action="store_true",
+        help="write a layer over the USD stage that is run: the stage as it is, and its bodies moving",
+    )
     run.add_argument(
         "--checkpoint-every",
         type=positive,
@@ -58,9 +64,11 @@ def execute(arguments: argparse.Namespace) -> int:
     scene = load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
     with held_interrupt() as check_interrupt:
-        from warpfem.usd import check_path
+        from warpfem.usd import check_path, require_other_file
     check_interrupt()
     check_path(out)
+    require_other_file(out, arguments.scene)
+    _require_stage(arguments)
     recipe = _recipe(arguments)
     if arguments.resume:
         scene = Checkpoint.read(checkpoint_path(out)).with_meshes(scene, recipe)
@@ -79,6 +87,7 @@ def execute(arguments: argparse.Namespace) -> int:
             checkpoint_every=arguments.checkpoint_every,
             resume=arguments.resume,
             recipe=recipe,
+            over=arguments.scene if arguments.over else None,
         )
         with held_interrupt() as check_interrupt, closing(recording) as frames:
             for _ in _progress(frames, scene.frames + 1) if say else frames:
@@ -106,6 +115,14 @@ def execute(arguments: argparse.Namespace) -> int:
         if code == OK:
             print(f"wrote {out}")
     return code
+
+
+def _require_stage(arguments: argparse.Namespace) -> None:
+    """Raises OutputError for --over with what cannot go over a stage."""
+    if arguments.over and arguments.scene.suffix.lower() not in SUFFIXES:
+        raise OutputError(f"--over writes a layer over a USD stage, and {arguments.scene} is none")
+    if arguments.over and (arguments.resume or arguments.checkpoint_every):
+        raise OutputError("--over cannot be resumed: leave out --resume and --checkpoint-every")
 
 
 def _recipe(arguments: argparse.Namespace) -> str:

@@ -11,6 +11,7 @@ from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale
 from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
+from warpfem.usd.over import OverWriter, require_other_file
 from warpfem.usd.physics.reader import read_stage_scene
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter
@@ -24,6 +25,7 @@ __all__ = [
     "ColorQuantity",
     "ColorScale",
     "FrameWriter",
+    "OverWriter",
     "UsdBody",
     "UsdWriter",
     "check_path",
@@ -32,4 +34,5 @@ __all__ = [
     "read_stage_scene",
     "read_surface_mesh",
     "read_tet_mesh",
+    "require_other_file",
 ]
