@@ -9,9 +9,12 @@ from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_a
 from warpfem.usd.background import BackgroundWriter
 from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
+from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.meshes import read_mesh, read_surface_mesh
+from warpfem.usd.over import OverWriter, require_other_file
+from warpfem.usd.physics.reader import read_stage_scene
 from warpfem.usd.saved import partial_path
-from warpfem.usd.writer import UsdWriter, check_path
+from warpfem.usd.writer import UsdWriter
 
 __all__ = [
     "AnimatedBody",
@@ -21,12 +24,16 @@ __all__ = [
     "BodyFrame",
     "ColorQuantity",
     "ColorScale",
+    "FrameWriter",
+    "OverWriter",
     "UsdBody",
     "UsdWriter",
     "check_path",
     "partial_path",
     "read_animation",
     "read_mesh",
+    "read_stage_scene",
     "read_surface_mesh",
+    "require_other_file",
     "spread_of",
 ]

@@ -45,15 +45,14 @@ def prim_names(names: Iterable[str]) -> list[str]:
     return result
 
 
-def define_world(stage: Usd.Stage, fps: float, up_axis: str, comment: str) -> None:
-    """Authors the default prim, the stage's units and clock, and the materials."""
+def define_world(stage: Usd.Stage, up_axis: str, comment: str) -> None:
+    """Authors the default prim, the stage's units, and the materials."""
     world = UsdGeom.Xform.Define(stage, WORLD).GetPrim()
     Usd.ModelAPI(world).SetKind(Kind.Tokens.component)
     stage.SetDefaultPrim(world)
     UsdGeom.SetStageUpAxis(stage, up_axis)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.GetRootLayer().comment = comment
-    set_clock(stage.GetRootLayer(), fps, 0)
 
     UsdGeom.Scope.Define(stage, LOOKS)
     color = _material(stage, "Body").CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
@@ -64,12 +63,6 @@ def define_world(stage: Usd.Stage, fps: float, up_axis: str, comment: str) -> No
     color.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float3))
     grey = _material(stage, "Obstacle").CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     grey.Set(Gf.Vec3f(_OBSTACLE_GREY))
-
-
-def set_clock(layer: Sdf.Layer, fps: float, frame_count: int) -> None:
-    """Authors the frame rate and the time codes 0..frame_count - 1."""
-    layer.timeCodesPerSecond = layer.framesPerSecond = fps
-    layer.startTimeCode, layer.endTimeCode = 0.0, float(max(frame_count - 1, 0))
 
 
 def paint_obstacle(prim: UsdGeom.Gprim) -> None:
