@@ -186,7 +186,6 @@ def test_a_plane_of_constant_z_is_2d(tmp_path):
             [("tetra", [[0, 1, 2, 3]]), ("hexahedron", [range(8)])],
             "1 cells of type 'hexahedron': only triangles",
         ),
-        ([("quad", [[0, 1, 2, 4]])], "1 cells of type 'quad': only triangles"),
         ([("line", [[0, 1]])], "no triangles or tetrahedra"),
         ([("tetra", [[0, 1, 2, 3]] * 2)], "cell 1 has the same points as cell 0"),
         ([("tetra", [[0, 1, 2, 77]])], "cell 0 refers to a point outside"),
@@ -198,6 +197,12 @@ def test_files_with_other_contents_are_refused_by_name(tmp_path, cells, message)
     with pytest.raises(MeshError, match=message) as caught:
         load_mesh(path)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_quadrilaterals_in_a_plane_are_refused(tmp_path):
+    square = [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+    with pytest.raises(MeshError, match="1 cells of type 'quad': only triangles"):
+        load_here(write(tmp_path / "a.vtu", square, [("quad", np.array([[0, 1, 2, 3]]))]))
 
 
 @pytest.mark.parametrize("read", [load_mesh, read_surface])
@@ -277,19 +282,24 @@ def test_what_meshio_prints_becomes_a_warning(tmp_path, capfd):
 CELL_DATA = {"E": [1e5, 2e5], "region": [3, 7], "density": [900.0, 1100.0], "gradient": [[1.0, 0.0, 0.0]] * 2}
 
 
-@pytest.mark.parametrize("name", ["data.vtu", "data.vtk", "data.msh"])
+@pytest.mark.parametrize("name", ["data.vtu", "data.vtk"])
 def test_cell_data_become_sets_and_values_per_cell(tmp_path, name):
     cells = [("triangle", [[0, 1, 2]]), ("tetra", [[0, 1, 2, 3], [1, 2, 3, 4]])]
     data = {key: [values[:1], values] for key, values in CELL_DATA.items()}  # the face has some, too
     mesh = load_mesh(write(tmp_path / name, TWO_TETRAHEDRA, cells, cell_data=data))
     values = {key: mesh.cell_data[key].tolist() for key in mesh.cell_data}
     assert values == {key: CELL_DATA[key] for key in ("E", "region", "density")}
-    if not name.endswith("msh"):  # which has no whole numbers but its own
-        assert {key: s.tolist() for key, s in mesh.cell_sets.items()} == {"region_3": [0], "region_7": [1]}
-        assert {key: s.tolist() for key, s in mesh.point_sets.items()} == {"region_3": [0, 1, 2]}
+    assert {key: s.tolist() for key, s in mesh.cell_sets.items()} == {"region_3": [0], "region_7": [1]}
+    assert {key: s.tolist() for key, s in mesh.point_sets.items()} == {"region_3": [0, 1, 2]}
     body = wf.Body("body", mesh, wf.NeoHookean(mesh.cell_data["E"], 0.3), density=mesh.cell_data["density"])
     np.testing.assert_array_equal(body.material.E, [1e5, 2e5])
     np.testing.assert_array_equal(body.density, [900.0, 1100.0])
+
+
+def test_element_data_of_gmsh_are_cell_data(tmp_path):
+    cells = [("tetra", [[0, 1, 2, 3], [1, 2, 3, 4]])]
+    path = write(tmp_path / "a.msh", TWO_TETRAHEDRA, cells, cell_data={"E": [[1e5, 2e5]]}, file_format="gmsh22")
+    assert load_here(path).cell_data["E"].tolist() == [1e5, 2e5]
 
 
 def test_references_of_medit_are_groups(tmp_path):
@@ -346,9 +356,18 @@ def TetMesh "a" {
     int[] primvars:region = [1, 2] ( interpolation = "uniform" )
     float[] primvars:youngsModulus = [1000, 2000] ( interpolation = "uniform" )
     float[] primvars:temperature = [1, 2, 3, 4, 5] ( interpolation = "vertex" )
-    def GeomSubset "bone" { uniform token elementType = "tetrahedron" int[] indices = [1] }
-    def GeomSubset "floor" { uniform token elementType = "face" int[] indices = [1] }
-    def GeomSubset "tip" { uniform token elementType = "point" int[] indices = [4] }
+    def GeomSubset "bone" {
+        uniform token elementType = "tetrahedron"
+        int[] indices = [1]
+    }
+    def GeomSubset "floor" {
+        uniform token elementType = "face"
+        int[] indices = [1]
+    }
+    def GeomSubset "tip" {
+        uniform token elementType = "point"
+        int[] indices = [4]
+    }
 }
 """)
     mesh = load_mesh(path)

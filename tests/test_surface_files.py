@@ -1,6 +1,5 @@
 """Surfaces from files that trimesh reads, and from faces in mesh files."""
 
-
 import numpy as np
 import pytest
 
@@ -158,7 +157,7 @@ def test_faces_in_a_mesh_file_are_a_surface(tmp_path, monkeypatch):
     points = write_mesh_file(path, [("triangle", [[0, 1, 2]]), ("quad", [[1, 2, 3, 4]]), ("triangle6", [quadratic])])
     read_points, triangles = read_surface(path)
     np.testing.assert_array_equal(read_points, points)
-    assert triangles.tolist() == [[0, 1, 2], [1, 2, 3], [5, 6, 7], [1, 3, 4]]
+    assert triangles.tolist() == [[0, 1, 2], [1, 2, 3], [1, 3, 4], [5, 6, 7]]
     filled = []
     monkeypatch.setattr(files, "tetrahedralize", lambda *arguments: filled.append(arguments))
     load_mesh(path, scale=2.0, edge_length=0.3, envelope=0.1, progress=False)
