@@ -148,7 +148,7 @@ def _filled(problem: dict[str, np.ndarray], progress: bool) -> tuple[np.ndarray,
             made = call_in_child(fill, path)
         except (ChildError, OSError) as error:
             raise MeshError(
-                f"fTetWild could not fill the surface ({error}): try another edge_length or envelope"
+                f"fTetWild could not fill the surface ({error}): try a smaller envelope, or another edge_length"
             ) from error
     return cache.keep(key, *made)
 

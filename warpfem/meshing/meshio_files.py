@@ -56,19 +56,28 @@ def _read_file(path: Path) -> Any:
     """The file as a ``meshio.Mesh``, with what meshio prints turned into errors and warnings."""
     import meshio
 
-    mark = _MARKS.get(path.suffix.lower())
+    suffix = path.suffix.lower()
     printed = io.StringIO()
     try:
-        if mark and not re.search(mark, path.read_bytes(), re.MULTILINE):
+        if suffix in _MARKS and not re.search(_MARKS[suffix], path.read_bytes(), re.MULTILINE):
             raise EOFError("a part is missing")
         with redirect_stdout(printed), redirect_stderr(printed):
             file = meshio.read(path)
+        if suffix == ".vtk":
+            _require_all_cells(path, file)
     except (Exception, SystemExit) as error:  # meshio raises anything on damaged files, and may exit
         reason = one_line(printed.getvalue()) or described(error)
         raise MeshError(f"{DAMAGED} ({reason})") from error
     if remarks := one_line(printed.getvalue()):
         warnings.warn(f"{path}: meshio says: {remarks}", stacklevel=3)
     return file
+
+
+def _require_all_cells(path: Path, file: Any) -> None:
+    """Raises EOFError where a legacy VTK file is cut short in its cell types, of which meshio takes what is there."""
+    stated = re.search(rb"^CELL_TYPES\s+(\d+)", path.read_bytes(), re.MULTILINE)
+    if stated and int(stated[1]) != sum(len(block.data) for block in file.cells):
+        raise EOFError("a part is missing")
 
 
 def _is_surface(file: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -40,9 +41,8 @@ def _parts(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     """Points and triangles of each instance of a geometry in the file."""
     import trimesh
 
-    is_whole = _IS_WHOLE.get(path.suffix.lower())
-    if is_whole and not is_whole(path.read_bytes()):
-        raise EOFError("a part is missing")
+    if check := _CHECKS.get(path.suffix.lower()):
+        check(path.read_bytes())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # what NumPy says of text that is not the number that should be there, and then leaves out
@@ -58,15 +58,47 @@ def _parts(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     return parts
 
 
-# What a whole file has: without it, trimesh takes a part for the whole.
+# ---- what trimesh does not notice: each raises ValueError
 
 
-def _whole_stl(content: bytes) -> bool:
+def _check_stl(content: bytes) -> None:
     triangle_count = int.from_bytes(content[80:84], "little")
-    if len(content) >= 84 and len(content) == 84 + 50 * triangle_count:
-        return True  # binary, even if it starts with the word of the text format
+    is_binary = len(content) >= 84 and len(content) == 84 + 50 * triangle_count  # even if it starts as the text does
     words = content[:100].split(maxsplit=1)[:1] + content.rstrip().rsplit(b"\n", 1)[-1].split(maxsplit=1)[:1]
-    return [word.lower() for word in words] == [b"solid", b"endsolid"]
+    if not is_binary and [word.lower() for word in words] != [b"solid", b"endsolid"]:
+        raise ValueError("a part is missing")
 
 
-_IS_WHOLE: dict[str, Callable[[bytes], bool]] = {".stl": _whole_stl}
+def _check_ply(content: bytes) -> None:
+    header, _, body = content.partition(b"end_header")
+    counts = re.findall(rb"^\s*element\s+\w+\s+(\d+)", header, re.MULTILINE)
+    faces_last = re.search(rb"element\s+face\s+\d+\s+property\s+list[^\n]*\s*\Z", header)
+    if re.search(rb"^\s*format\s+ascii", header, re.MULTILINE):
+        _check_rows(body, sum(map(int, counts)), faces_last is not None)
+
+
+def _check_off(content: bytes) -> None:
+    rows = re.sub(rb"#[^\n]*", b"", content).partition(b"OFF")[2]
+    counts = re.match(rb"\s*(\d+)\s+(\d+)[^\n]*", rows)
+    if counts:
+        _check_rows(rows[counts.end() :], int(counts[1]) + int(counts[2]), True)
+
+
+def _check_rows(text: bytes, count: int, faces_last: bool) -> None:
+    rows = [line for line in text.splitlines() if line.strip()]
+    last = rows[count - 1].split() if 0 < count <= len(rows) else []
+    if len(rows) < count or (faces_last and count and len(last) <= int(last[0])):
+        raise ValueError("a part is missing")
+
+
+def _check_obj(content: bytes) -> None:
+    if re.search(rb"^\s*f\s(?:[^\n]*\s)?0(?=[/\s]|\Z)", content, re.MULTILINE):
+        raise ValueError("a face refers to vertex 0, and they count from 1")
+
+
+_CHECKS: dict[str, Callable[[bytes], None]] = {
+    ".stl": _check_stl,
+    ".ply": _check_ply,
+    ".off": _check_off,
+    ".obj": _check_obj,
+}
