@@ -751,7 +751,9 @@ def _require_resolved(scene: Scene, epsilon: float, dtype: str) -> None:
     for body in scene.bodies:
         mesh = body.mesh
         B = mesh.inverse_shape_matrices
-        steepest = np.maximum(np.linalg.norm(B, axis=2).max(axis=1), np.linalg.norm(B.sum(axis=1), axis=1))
+        last = -B.sum(axis=1)
+        squares = np.maximum(np.einsum("cij,cij->ci", B, B).max(axis=1), np.einsum("ci,ci->c", last, last))
+        steepest = np.sqrt(squares)
         size = float(np.linalg.norm(np.ptp(mesh.bounding_box, axis=0)))
         thin = np.flatnonzero(steepest * (10.0 * epsilon * size) > 1.0)
         if len(thin):

@@ -33,17 +33,20 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
     largest = 0.0
     density = _cell_densities(model)
     for block in model.blocks:
-        bounds = _linear_bounds(block, u) if block.shape.order == 1 else _quadratic_bounds(model, block, u)
+        bounds = _linear_bounds(model, block, u) if block.shape.order == 1 else _quadratic_bounds(model, block, u)
         largest = np.maximum(largest, (bounds / density[block.index]).max())  # not a number stays
     if model.contact is not None:
         largest += model.contact.largest_stiffness_over_mass(model.host_mass)
     return float(np.sqrt(largest))
 
 
-def _linear_bounds(block: CellBlock, u: wp.array) -> np.ndarray:
+def _linear_bounds(model: Model, block: CellBlock, u: wp.array) -> np.ndarray:
     """(tr A^8)^(1/8) of each cell at unit density, (count,) float64."""
     out = wp.zeros(block.count, dtype=wp.float64, device=block.device)
-    block.launch("frequency_bound", [u], [out], kernels=block.bounding_kernels)
+    parts = [slice(cells.start, cells.stop) for cells in share(block.count, model.team.size)]
+    kernels = block.bounding_kernels
+    launches = [[block.launch("frequency_bound", [u], [out[p]], part=p, kernels=kernels, record=True)] for p in parts]
+    model.team.run(jobs(launches))
     return block.shape.point_count * out.numpy()
 
 
