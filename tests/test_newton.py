@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from test_readme import python_blocks
 
 import warpfem as wf
 
@@ -237,6 +238,26 @@ def test_parts_that_are_not_connected_are_bodies_of_their_own():
     assert state.particle_q.numpy()[8].tolist() == [9.0, 9.0, 9.0]
 
 
+def test_worlds_have_gravity_of_their_own_and_share_obstacles():
+    one = newton.ModelBuilder(up_axis=newton.Axis.Y)
+    add(one, BLOCK)
+    one.add_ground_plane(height=-1.0)
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
+    builder.replicate(one, 2)
+    model = finalized(builder)
+    assert model.world_count == 2 and model.shape_count == 2
+    model.set_gravity([(0.0, -1.0, 0.0), (0.0, -2.0, 0.0)])
+    solver = SolverWarpfem(model)
+    assert len(solver.solid.scene.bodies) == 2 and len(solver.solid.scene.obstacles) == 1
+    state = run(solver, model, dt=0.1, steps=1)
+    np.testing.assert_allclose(state.particle_qd.numpy()[:, 1], [-0.1] * 8 + [-0.2] * 8, rtol=1e-4)
+    other = newton.ModelBuilder(up_axis=newton.Axis.Y)
+    add(other, BLOCK)
+    builder.add_world(other)
+    with pytest.warns(UserWarning, match="obstacles of some worlds are felt in all .1 in all"):
+        SolverWarpfem(finalized(builder))
+
+
 def test_what_is_left_out_is_named():
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
     add(builder, BLOCK, k_damp=10.0)
@@ -291,3 +312,10 @@ def test_steps_are_not_captured():
     solver, state = SolverWarpfem(model), model.state()
     with pytest.raises(wf.SimulationError, match="cannot be captured"), wp.ScopedCapture("cpu"):
         solver.step(state, state, None, None, 0.01)
+
+
+def test_the_example_of_the_readme_runs(capsys):
+    (block,) = [block for block in python_blocks() if "import newton" in block]
+    exec(compile(block, "README.md", "exec"), {"wf": wf})
+    lowest, residual = map(float, capsys.readouterr().out.split())
+    assert 0.8 < lowest < 0.999 and residual < 1e-3
