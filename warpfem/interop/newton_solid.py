@@ -18,6 +18,9 @@ from warpfem.solvers.base import Solver
 REST_TOLERANCE = 1e-3
 """Largest strain of the model's first positions against the rest shapes of its tetrahedra: far above rounding."""
 
+ROUNDING = 1e-6
+"""The part by which densities may differ that are meant to be one: masses have float32."""
+
 
 @dataclass(frozen=True, eq=False)
 class NewtonSolid:
@@ -127,7 +130,10 @@ def _densities(mesh: Mesh, mass: np.ndarray, held: np.ndarray, name: str) -> tup
     mean = mass[~held].sum() / volume[~held].sum()
     density = np.where(held, mean, mass / volume)
     least = np.where(held, np.inf, density)[mesh.cells].min(axis=1)
-    return np.where(np.isfinite(least), least, mean), np.where(held, mean * volume, mass)
+    least = np.where(np.isfinite(least), least, mean)
+    if np.ptp(least) <= ROUNDING * mean:
+        least[:] = least.min()
+    return least, np.where(held, mean * volume, mass)
 
 
 def _obstacles(model: newton.Model) -> list[Obstacle]:
