@@ -21,6 +21,7 @@ EXTRAS = {
     "scipy": "bench",
     "scikit-fem": "bench",
     "distributed": "cluster",
+    "newton": "newton",
 }
 """Optional packages and the extra that brings them."""
 

@@ -18,6 +18,9 @@ from warpfem.solvers.base import Solver
 REST_TOLERANCE = 1e-3
 """Largest strain of the model's first positions against the rest shapes of its tetrahedra: far above rounding."""
 
+ROUNDING = 1e-6
+"""The part by which densities may differ that are meant to be one: masses have float32."""
+
 
 @dataclass(frozen=True, eq=False)
 class NewtonSolid:
@@ -127,31 +130,39 @@ def _densities(mesh: Mesh, mass: np.ndarray, held: np.ndarray, name: str) -> tup
     mean = mass[~held].sum() / volume[~held].sum()
     density = np.where(held, mean, mass / volume)
     least = np.where(held, np.inf, density)[mesh.cells].min(axis=1)
-    return np.where(np.isfinite(least), least, mean), np.where(held, mean * volume, mass)
+    least = np.where(np.isfinite(least), least, mean)
+    if np.ptp(least) <= ROUNDING * mean:
+        least[:] = least.min()
+    return least, np.where(held, mean * volume, mass)
 
 
 def _obstacles(model: newton.Model) -> list[Obstacle]:
-    """The model's planes and spheres that do not move; warns of other shapes that particles would touch."""
-    obstacles: list[Obstacle] = []
+    """The model's planes and spheres that do not move, each once; warns of other shapes that particles would touch."""
     if not model.shape_count:
-        return obstacles
+        return []
     flags, kinds, bodies = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_body.numpy()
     places, scales = model.shape_transform.numpy().astype(np.float64), model.shape_scale.numpy()
     friction = np.sqrt(model.soft_contact_mu * model.shape_material_mu.numpy().astype(np.float64))
+    worlds: dict[Obstacle, set[int]] = {}
     for shape in np.flatnonzero(flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)):
-        place = tuple(places[shape, :3])
+        label, place = model.shape_label[shape], tuple(places[shape, :3].tolist())
         if bodies[shape] < 0 and kinds[shape] == newton.GeoType.PLANE:
             if scales[shape, :2].any():
-                _warn(f"shape '{model.shape_label[shape]}' is a plane with edges: it is taken for an infinite one")
+                _warn(f"shape '{label}' is a plane with edges: it is taken for an infinite one")
             normal = np.array(wp.quat_rotate(wp.quat(*places[shape, 3:]), wp.vec3(0.0, 0.0, 1.0)))
-            obstacles.append(Plane(place, tuple(normal), friction=float(friction[shape])))
+            obstacle: Obstacle = Plane(place, tuple(normal.tolist()), friction=float(friction[shape]))
         elif bodies[shape] < 0 and kinds[shape] == newton.GeoType.SPHERE:
-            obstacles.append(Sphere(place, float(scales[shape, 0]), friction=float(friction[shape])))
+            obstacle = Sphere(place, float(scales[shape, 0]), friction=float(friction[shape]))
         else:
             kind = newton.GeoType(int(kinds[shape])).name.lower()
             moves = " of a body" if bodies[shape] >= 0 else ""
-            _warn(f"shape '{model.shape_label[shape]}' is a {kind}{moves}: solids pass through it")
-    return obstacles
+            _warn(f"shape '{label}' is a {kind}{moves}: solids pass through it")
+            continue
+        worlds.setdefault(obstacle, set()).add(int(model.shape_world.numpy()[shape]))
+    single = [obstacle for obstacle, own in worlds.items() if -1 not in own and len(own) < model.world_count]
+    if single:
+        _warn(f"obstacles of some worlds are felt in all ({len(single)} in all)")
+    return list(worlds)
 
 
 def _warn_of_omissions(model: newton.Model, point_count: int) -> None:
@@ -163,6 +174,7 @@ def _warn_of_omissions(model: newton.Model, point_count: int) -> None:
         (_count(triangles), "the stiffness, damping, drag and lift of triangles are left out"),
         (_count(_rows(model.edge_bending_properties)), "the bending stiffness of edges is left out"),
         (model.spring_count, "springs are left out"),
+        (model.attachment_particle_body_count, "attachments of particles to bodies are left out"),
         (model.body_count, "rigid bodies stay where they are"),
         (model.particle_count - point_count, "particles of no tetrahedron stay where they are"),
     ]

@@ -1,4 +1,7 @@
-"""The arrays of a state are memory that NumPy, PyTorch and JAX share: what one writes, the others see."""
+"""Neighbours: the arrays of a state are memory that NumPy, PyTorch and JAX share, and what a missing one is told of."""
+
+import importlib
+import sys
 
 import numpy as np
 import pytest
@@ -48,3 +51,11 @@ def test_jax_shares(state):
     assert view.ptr == state.u.ptr and view.dtype == state.u.dtype
     state.u.fill_(5.0)
     assert np.asarray(wp.to_jax(state.u)).tolist() == [[5.0, 5.0, 5.0]] * MESH.point_count
+
+
+def test_a_missing_newton_is_named_with_its_extra(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("warpfem.interop.newton")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "newton", None)
+    with pytest.raises(wf.MissingExtraError, match=r"'newton': pip install 'warpfem\[newton\]'"):
+        importlib.import_module("warpfem.interop.newton")
