@@ -688,3 +688,88 @@ def test_over_wants_a_stage(tmp_path: Path, capsys) -> None:
 
 def _body() -> wf.Body:
     return wf.Body("b", CUBE, wf.StableNeoHookean(E=1e5, nu=0.4))
+
+
+# ---- round trip
+
+
+def demanding_scene() -> wf.Scene:
+    soft = wf.Body(
+        "soft one",
+        wf.Mesh.box((1, 1, 1), (2, 2, 2), (0, 0.02, 0)),
+        wf.NeoHookean(E=2e5, nu=0.3),
+        density=np.where(np.arange(40) < 15, 800.0, 1200.0),
+        displacement=lambda x: 0.02 * x[:, [1, 2, 0]],
+        velocity=(0.0, -1.0, 0.0),
+    )
+    held = wf.Body(
+        "held",
+        wf.Mesh.box((1, 1, 1), (2, 1, 1), (100, 3, 0)),
+        wf.StableNeoHookean(E=np.where(np.arange(10) < 5, 1e5, 1e6), nu=0.4),
+        supports=[wf.Pin("left"), wf.Pin([5], axes=(0, 1, 2))],
+    )
+    turned = ((0.8, 0.6, 0.0), (-0.6, 0.8, 0.0), (0.0, 0.0, 1.0))
+    return wf.Scene(
+        [soft, held],
+        wf.BackwardEuler(),
+        dt=1 / 120,
+        gravity=(1.0, -9.0, 0.0),
+        damping=0.3,
+        obstacles=[
+            wf.Plane((0, 0, 0), (0.0, 2.0, 0.1), friction=0.3, stiffness=1e7),
+            wf.Sphere((0.5, -1.0, 0.5), 1.01),
+            wf.Box((1.5, 0.5, 0.5), (1.0, 0.5, 2.0), turned, friction=0.1),
+            wf.BoxWalls((-90, -90, -90), (190, 90, 90)),
+        ],
+        fps=30.0,
+        frames=3,
+        up_axis="Z",
+    )
+
+
+def test_what_a_run_writes_is_a_stage_of_the_same_physics(tmp_path: Path) -> None:
+    scene = demanding_scene()
+    first, second = tmp_path / "first.usdc", tmp_path / "second.usdc"
+    wf.run(scene, first)
+    assert validation_errors(Usd.Stage.Open(str(first))) == []
+    again = read(first)
+
+    assert (again.fps, again.frames, again.up_axis, again.damping) == (30.0, 3, "Z", 0.3)
+    assert again.gravity == pytest.approx(scene.gravity, rel=1e-6)
+    assert len(again.obstacles) == 9
+    for one, other in zip([*scene.obstacles[:3], *scene.obstacles[3].planes()], again.obstacles, strict=True):
+        assert type(one) is type(other) and one.stiffness == other.stiffness
+        assert one.friction == other.friction
+        for name in {"point", "normal", "center", "radius", "size"} & set(vars(one)):
+            assert getattr(other, name) == pytest.approx(getattr(one, name), abs=1e-6)
+    np.testing.assert_allclose(again.obstacles[2].axes, scene.obstacles[2].axes, rtol=0, atol=1e-6)
+    for one, other in zip(scene.bodies, again.bodies, strict=True):
+        np.testing.assert_allclose(other.mesh.points, one.mesh.points, rtol=1e-6)
+        np.testing.assert_array_equal(other.mesh.cells, one.mesh.cells)
+        assert type(other.material) is type(one.material)
+        for name in ("E", "nu"):
+            np.testing.assert_array_equal(getattr(other.material, name), getattr(one.material, name))
+        np.testing.assert_array_equal(other.density, one.density)
+        np.testing.assert_allclose(other.initial_displacement(), one.initial_displacement(), rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(other.initial_velocity(), one.initial_velocity())
+    assert [list(pin.points) for pin in again.bodies[1].supports] == [[0, 1, 2, 3, 5]]
+
+    wf.run(again, second)
+    for prim in ("/World/soft_one/simulation", "/World/held/simulation"):
+        np.testing.assert_allclose(points_at(second, prim, 3), points_at(first, prim, 3), rtol=0, atol=2e-5)
+
+
+def test_what_a_stage_has_no_words_for_is_said_when_it_is_read(tmp_path: Path) -> None:
+    body = wf.Body(
+        "b",
+        CUBE,
+        wf.StableNeoHookean(E=1e5, nu=0.4),
+        supports=[wf.Pin("left", axes=(0,))],
+        loads=[wf.Traction("right", (1.0, 0.0, 0.0))],
+        element="quadratic",
+    )
+    wf.run(wf.Scene([body], wf.BackwardEuler(), frames=1), tmp_path / "run.usdc")
+    assert remarks(tmp_path / "run.usdc") == [
+        "/World/b/simulation: the scene that it comes from had quadratic cells, pins of single directions, tractions, "
+        "which a stage has no words for: it runs without"
+    ]

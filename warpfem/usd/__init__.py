@@ -12,6 +12,7 @@ from warpfem.usd.colors import ColorQuantity, ColorScale
 from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
 from warpfem.usd.over import OverWriter, require_other_file
+from warpfem.usd.physics.author import BodyPhysics, ScenePhysics, too_many_materials
 from warpfem.usd.physics.reader import read_stage_scene
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter
@@ -22,10 +23,12 @@ __all__ = [
     "Animation",
     "BackgroundWriter",
     "BodyFrame",
+    "BodyPhysics",
     "ColorQuantity",
     "ColorScale",
     "FrameWriter",
     "OverWriter",
+    "ScenePhysics",
     "UsdBody",
     "UsdWriter",
     "check_path",
@@ -35,4 +38,5 @@ __all__ = [
     "read_surface_mesh",
     "read_tet_mesh",
     "require_other_file",
+    "too_many_materials",
 ]
