@@ -15,8 +15,10 @@ from test_usd import validation_errors
 
 import warpfem as wf
 from warpfem.cli import main
+from warpfem.commands.output import kept
 from warpfem.embedding import Embedding
-from warpfem.usd import BodyFrame, OverWriter, partial_path, read_stage_scene
+from warpfem.trade.problem import Problem, Setting
+from warpfem.usd import BodyFrame, OverWriter, partial_path
 from warpfem.usd.physics.reader import stage_scene
 
 
@@ -231,6 +233,18 @@ def Xform "Up"
     np.testing.assert_allclose(ends[1], ends[0][:, [0, 2, 1]] * (1, -1, 1), rtol=0, atol=2e-5)
 
 
+def test_studies_take_stages(tmp_path: Path) -> None:
+    write(tmp_path / "material.usda", MATERIAL)
+    path = write(tmp_path / "stage.usda", SCENE, tets(), head=HEAD + "\n    subLayers = [@./material.usda@]")
+    problem = Problem.of(path, frames=7)
+    scene = problem.build(Setting.of(dt="1/60", element="P2")).scene
+    assert (scene.dt, scene.frames, scene.bodies[0].mesh.order) == (pytest.approx(1 / 60), 7, 2)
+    problem.require_same_file()
+    write(tmp_path / "material.usda", MATERIAL.replace("1e5", "2e5"))
+    with pytest.raises(wf.SceneError, match="not the file that the study was begun with"):
+        problem.require_same_file()
+
+
 def test_bodies_fall_as_galileo_says(tmp_path: Path) -> None:
     scene = read(write(tmp_path / "stage.usda", SCENE, tets(), MATERIAL))
     dt = 1.0 / 120.0
@@ -254,7 +268,7 @@ def test_bodies_fall_as_galileo_says(tmp_path: Path) -> None:
 def test_gravity(tmp_path: Path, scene: str, up: str, expected: tuple | None) -> None:
     prim = f'def PhysicsScene "Scene" {{\n{scene}\n}}'
     path = write(tmp_path / "s.usda", prim, tets(), MATERIAL, head=f'upAxis = "{up}"\n    metersPerUnit = 1')
-    gravity = read_stage_scene(path).gravity
+    gravity = stage_scene(str(path)).gravity
     assert gravity == (None if expected is None else pytest.approx(expected))
 
 
@@ -600,7 +614,7 @@ def moved_affinely(body, shift: float) -> BodyFrame:
 
 def test_a_skin_follows_an_affine_motion_exactly(tmp_path: Path) -> None:
     writer, path = over_writer(tmp_path)
-    (body,) = read_stage_scene(path).bodies
+    (body,) = stage_scene(str(path)).bodies
     with writer:
         writer.write_frame([moved_affinely(body, 1.0)])
     stage = Usd.Stage.Open(str(tmp_path / "over.usdc"))
@@ -633,14 +647,16 @@ def test_a_partial_layer_opens_over_the_stage(tmp_path: Path) -> None:
     stage = Usd.Stage.Open(str(path))
     UsdGeom.PointBased.Get(stage, "/Body/sim").GetPointsAttr().Set(points_at(path, "/Body/sim") + 7.0, 102.0)
     stage.Save()
-    (body,) = read_stage_scene(path).bodies
+    (body,) = stage_scene(str(path)).bodies
     for shift in (0.0, 1.0, 2.0):
         writer.write_frame([moved_affinely(body, shift)])
     writer.flush()
     partial = partial_path(tmp_path / "over.usdc")
     seen = [points_at(partial, prim, code) for prim in ("/Body/sim", "/Body/skin") for code in (101, 102, 103)]
     assert Usd.Stage.Open(str(partial)).GetPrimAtPath("/Camera")
+    assert kept(tmp_path / "over.usdc") == f"3 frames are in {partial}"
     writer.close()
+    assert kept(tmp_path / "over.usdc") == f"3 frames are in {tmp_path / 'over.usdc'}"
     assert not partial.exists()
     merged = [
         points_at(tmp_path / "over.usdc", prim, code)

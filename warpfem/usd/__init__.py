@@ -11,7 +11,7 @@ from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale
 from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
-from warpfem.usd.over import OverWriter, require_other_file
+from warpfem.usd.over import OverWriter, frames_over, require_other_file
 from warpfem.usd.physics.author import BodyPhysics, ScenePhysics, too_many_materials
 from warpfem.usd.physics.reader import read_stage_scene
 from warpfem.usd.saved import partial_path
@@ -32,6 +32,7 @@ __all__ = [
     "UsdBody",
     "UsdWriter",
     "check_path",
+    "frames_over",
     "partial_path",
     "read_animation",
     "read_stage_scene",
