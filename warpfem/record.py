@@ -19,6 +19,7 @@ from warpfem.log import RunLog
 from warpfem.model import Model
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
+from warpfem.stage import physics_of
 
 if TYPE_CHECKING:
     from warpfem.usd import BodyFrame, UsdBody
@@ -91,6 +92,7 @@ def record(
             fps=scene.fps,
             up_axis=scene.up_axis,
             obstacles=scene.obstacles,
+            physics=physics_of(scene),
             color_by=scene.color_by,
             comment=comment,
             keep=keep,

@@ -15,7 +15,7 @@ from typing import Any
 
 from warpfem.errors import SceneError, user_code
 from warpfem.scene import Scene
-from warpfem.stage import STEP, SUFFIXES, read_stage
+from warpfem.stage import STEP, SUFFIXES, read_stage, stage_files
 
 
 def load_scene(path: str | Path, settings: Mapping[str, str] | None = None) -> Scene:
@@ -54,7 +54,7 @@ def scene_parameters(path: str | Path) -> Mapping[str, inspect.Parameter]:
 
 
 def source_digest(path: str | Path) -> str:
-    """Names what a scene file says: its contents, and those of the neighbours that it imports, directly or not.
+    """Names what a scene file says: its contents, and those of the files that it imports or refers to.
 
     Raises:
         SceneError: no such file.
@@ -63,6 +63,8 @@ def source_digest(path: str | Path) -> str:
     if not path.is_file():
         raise SceneError(f"no scene file '{path}'")
     digest, found, left = hashlib.sha256(), {path}, [path]
+    if path.suffix.lower() in SUFFIXES:
+        left = [Path(file) for file in stage_files(path)]
     while left:
         file = left.pop()
         contents = file.read_bytes()

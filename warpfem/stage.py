@@ -1,7 +1,8 @@
-"""Scenes out of USD stages that have physics on them."""
+"""Scenes out of USD stages that have physics on them, and scenes in the words of such a stage."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,14 +10,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpfem.boundary import Pin
+from warpfem.boundary import Load, Pin, Support
 from warpfem.errors import WarpfemError
-from warpfem.materials import MATERIALS, StableNeoHookean
+from warpfem.materials import MATERIALS, HookeanMaterial, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.scene import Body, Scene
 from warpfem.solvers import BackwardEuler
 
 if TYPE_CHECKING:
+    from warpfem.usd import BodyPhysics, ScenePhysics
     from warpfem.usd.physics.data import StageBody
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -80,6 +82,63 @@ def _body(path: str, body: StageBody) -> Body:
             displacement=displacement if displacement.any() else None,
             velocity=body.velocities if np.any(body.velocities) else None,
         )
+
+
+def stage_files(path: str | Path) -> tuple[str, ...]:
+    """The files that a stage is made of.
+
+    Raises:
+        SceneError: as :func:`read_stage`.
+    """
+    from warpfem.usd import read_stage_scene
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they come when the scene is read
+        return read_stage_scene(path).files
+
+
+def physics_of(scene: Scene) -> ScenePhysics | None:
+    """What a file says of a scene for :func:`read_stage`; ``None`` in 2D, for which stages have no words."""
+    from warpfem.usd import ScenePhysics
+
+    if scene.dim == 2:
+        return None
+    return ScenePhysics(scene.gravity, scene.damping, [_body_physics(body) for body in scene.bodies])
+
+
+def _body_physics(body: Body) -> BodyPhysics:
+    from warpfem.usd import BodyPhysics, too_many_materials
+
+    material, lacking = body.material, []
+    known = isinstance(material, HookeanMaterial) and MATERIALS.get(material.name) is type(material)
+    moduli = (material.E, material.nu) if isinstance(material, HookeanMaterial) else (np.nan, np.nan)
+    if not known:
+        lacking.append(f"the material {type(material).__name__}")
+    columns = np.broadcast_arrays(*(np.asarray(own, float) for own in (*moduli, body.density)))
+    materials = np.column_stack([np.atleast_1d(own) for own in columns])
+    if too_many_materials(materials):
+        materials = np.median(materials, axis=0, keepdims=True)
+        lacking.append("moduli or densities that differ from cell to cell")
+    if body.element != "linear":
+        lacking.append(f"{body.element} cells")
+    pins = [own for own in body.supports if isinstance(own, Pin) and (own.axes is None or len(set(own.axes)) == 3)]
+    lacking += sorted({_plural(own) for own in (*body.supports, *body.loads) if own not in pins})
+    held = [body.mesh.select_points(own.points) for own in pins]
+    return BodyPhysics(
+        material.name if known else "",
+        np.repeat(materials, len(body.mesh.shape.parts), axis=0) if len(materials) > 1 else materials,
+        np.unique(np.concatenate(held)) if held else np.zeros(0, np.int32),
+        ", ".join(lacking),
+    )
+
+
+def _plural(term: Support | Load) -> str:
+    return {
+        "Pin": "pins of single directions",
+        "PrescribedMotion": "prescribed motions",
+        "PointForce": "point forces",
+        "Traction": "tractions",
+    }[type(term).__name__]
 
 
 @contextmanager

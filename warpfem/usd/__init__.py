@@ -11,7 +11,8 @@ from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.meshes import read_mesh, read_surface_mesh
-from warpfem.usd.over import OverWriter, require_other_file
+from warpfem.usd.over import OverWriter, frames_over, require_other_file
+from warpfem.usd.physics.author import BodyPhysics, ScenePhysics, too_many_materials
 from warpfem.usd.physics.reader import read_stage_scene
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter
@@ -22,13 +23,16 @@ __all__ = [
     "Animation",
     "BackgroundWriter",
     "BodyFrame",
+    "BodyPhysics",
     "ColorQuantity",
     "ColorScale",
     "FrameWriter",
     "OverWriter",
+    "ScenePhysics",
     "UsdBody",
     "UsdWriter",
     "check_path",
+    "frames_over",
     "partial_path",
     "read_animation",
     "read_mesh",
@@ -36,4 +40,5 @@ __all__ = [
     "read_surface_mesh",
     "require_other_file",
     "spread_of",
+    "too_many_materials",
 ]

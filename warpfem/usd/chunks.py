@@ -207,6 +207,7 @@ class ChunkedLayer:
     def _go_over_base(self, layer: Sdf.Layer) -> None:
         if self._base:
             layer.subLayerPaths.append(self._base)
+            layer.customLayerData = {**layer.customLayerData, "warpfem": {"frames": self.frame_count}}
 
     def discard(self) -> None:
         """Removes the partial file, with its folder."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Vt
 
+from warpfem.child import read_in_child
 from warpfem.embedding import Embedding
 from warpfem.errors import OutputError
 from warpfem.mesh import Mesh
@@ -98,6 +99,24 @@ def require_other_file(path: Path, stage: str | Path) -> None:
     """Raises OutputError if an output would replace the stage that it comes from."""
     if path.exists() and os.path.exists(stage) and os.path.samefile(path, stage):
         raise OutputError(f"{path} is the stage that is to be simulated: take another output")
+
+
+def frames_over(path: str | Path) -> int:
+    """The number of frames in a layer over a stage, partial or finished.
+
+    Raises:
+        OutputError: it is missing, damaged or none that :class:`OverWriter` wrote.
+    """
+    return read_in_child(stated_frames, path, OutputError)
+
+
+def stated_frames(path: str) -> int:
+    """What :func:`frames_over` returns; called in a child process."""
+    with reporting(f"{path} cannot be read as USD", OutputError):
+        stated = Sdf.Layer.FindOrOpen(path).customLayerData.get("warpfem", {})
+    if "frames" not in stated:
+        raise OutputError(f"{path} is no layer over a stage that warpfem wrote")
+    return int(stated["frames"])
 
 
 class OverBody:

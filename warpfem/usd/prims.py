@@ -23,6 +23,7 @@ from warpfem.usd.colors import ColorQuantity, ColorScale
 WORLD = Sdf.Path("/World")
 TETS, OBSTACLES = "simulation", "Obstacles"
 LOOKS = WORLD.AppendChild("Looks")
+PHYSICS = WORLD.AppendChild("Physics")
 POINT_PRIMVARS: dict[ColorQuantity, str] = {"von_mises": "vonMisesPoint", "jacobian": "JPoint"}
 CELL_PRIMVARS: dict[ColorQuantity, str] = {"von_mises": "vonMises", "jacobian": "J"}
 
@@ -32,8 +33,8 @@ _FAR = 16.0
 
 
 def prim_names(names: Iterable[str]) -> list[str]:
-    """Valid prim names, unique among themselves and apart from ``Looks`` and ``Obstacles``."""
-    taken, result = {LOOKS.name, OBSTACLES}, []
+    """Valid prim names, unique among themselves and apart from those of warpfem's own prims."""
+    taken, result = {LOOKS.name, PHYSICS.name, OBSTACLES}, []
     for name in names:
         stem = Tf.MakeValidIdentifier(name or "body")
         unique, count = stem, 1
@@ -192,6 +193,11 @@ class BodyPrims:
                 result |= _primvar(self._tets, CELL_PRIMVARS[quantity], cells[quantity])
                 result |= _primvar(self._tets, POINT_PRIMVARS[quantity], averages[quantity])
         return result
+
+    @property
+    def simulation(self) -> Sdf.Path | None:
+        """The ``TetMesh``, if there is one."""
+        return self._tets
 
     def surface_attribute(self, quantity: ColorQuantity) -> Sdf.Path:
         """The attribute of the point values on the surface."""

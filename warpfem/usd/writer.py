@@ -18,6 +18,7 @@ from warpfem.usd.clock import Clock
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.obstacles import define_obstacles
+from warpfem.usd.physics.author import ScenePhysics, author_physics
 from warpfem.usd.prims import POINT_PRIMVARS, BodyPrims, define_world, prim_names
 from warpfem.usd.saved import Chunk, partial_path, saved_chunks
 from warpfem.usd.stages import reporting
@@ -39,7 +40,8 @@ class UsdWriter(FrameWriter):
     ``vonMisesPoint`` and ``JPoint`` per point (averages weighted by rest volume). ``displayColor`` shows
     one of the latter; the custom data of ``/World`` says which, and the range of its colours. Points are
     float32; those of a body that is far from the origin for its size are relative to a double-precision
-    translation of its Xform.
+    translation of its Xform. ``/World/Physics`` says what was simulated, as far as UsdPhysics and the proposal for
+    deformable bodies have words for it.
 
     Used as a context manager it closes also when the block raises, so that all finished frames are kept.
     """
@@ -54,6 +56,7 @@ class UsdWriter(FrameWriter):
         fps: float,
         up_axis: Literal["Y", "Z"] = "Y",
         obstacles: Sequence[Obstacle] = (),
+        physics: ScenePhysics | None = None,
         color_by: ColorQuantity = "von_mises",
         color_range: tuple[float, float] | None = None,
         frames_per_chunk: int = 8,
@@ -70,6 +73,7 @@ class UsdWriter(FrameWriter):
             fps: frames per second, > 0: frame i is at i / fps seconds.
             up_axis: the axis that viewers show as up.
             obstacles: drawn as fixed prims.
+            physics: what the file says of the scene, for other simulators and to be read as a stage; not in 2D.
             color_by: the quantity that ``displayColor`` shows.
             color_range: values of the first and last colour; ``None``: 0..s for von Mises, 1 - s..1 + s for
                 J, with s such that at most 0.5 % of a body's surface points are beyond in any frame.
@@ -102,6 +106,9 @@ class UsdWriter(FrameWriter):
             rest = self._samples([body.rest for body in self._bodies], "the rest shape")
             for attribute, value in rest.items():
                 stage.GetAttributeAtPath(attribute).Set(value)
+            meshes = [body.simulation for body in self._bodies if body.simulation is not None]
+            if physics is not None and meshes:
+                author_physics(stage, physics, meshes, obstacles)
             kept = [] if keep is None else self._find_kept(*keep)
             self._check_room(rest, expected_frames)
             self._layer = ChunkedLayer(self.path, static, rest, Clock(fps), frames_per_chunk, self._metadata(), kept)

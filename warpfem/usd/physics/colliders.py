@@ -8,6 +8,7 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 
 from warpfem.boundary import Box, Obstacle, Plane, Sphere
+from warpfem.usd.physics import tokens
 from warpfem.usd.physics.view import StageView
 
 _ROUNDING = 1e-5
@@ -62,18 +63,19 @@ def _reason_to_skip(view: StageView, prim: Usd.Prim) -> str:
 def _obstacle(view: StageView, prim: Usd.Prim) -> Obstacle | None:
     matrix = view.to_world(prim)
     linear, origin = matrix[:3, :3], matrix[3, :3].tolist()
+    feel = _friction(view, prim), view.number(prim, tokens.STIFFNESS)
     if prim.IsA(UsdGeom.Plane):
         axis = np.eye(3)["XYZ".index(UsdGeom.Plane(prim).GetAxisAttr().Get(view.start))]
-        return Plane(origin, (np.linalg.inv(linear) @ axis).tolist(), _friction(view, prim))
+        return Plane(origin, (np.linalg.inv(linear) @ axis).tolist(), *feel)
     scales = np.linalg.norm(linear, axis=1)
     edges = linear / scales[:, None]
     if np.abs(edges @ edges.T - np.eye(3)).max() > _ROUNDING:
         return None
     if prim.IsA(UsdGeom.Sphere) and np.ptp(scales) <= _ROUNDING * scales.max():
-        return Sphere(origin, UsdGeom.Sphere(prim).GetRadiusAttr().Get(view.start) * scales[0], _friction(view, prim))
+        return Sphere(origin, UsdGeom.Sphere(prim).GetRadiusAttr().Get(view.start) * scales[0], *feel)
     if prim.IsA(UsdGeom.Cube):
         size = UsdGeom.Cube(prim).GetSizeAttr().Get(view.start) * scales
-        return Box(origin, size.tolist(), edges.tolist(), _friction(view, prim))
+        return Box(origin, size.tolist(), edges.tolist(), *feel)
     return None
 
 

@@ -93,6 +93,7 @@ class StageScene:
         fps: frames per second.
         frames: frames from the first time code to the last, ``None`` if the stage has no range.
         damping: mass-proportional damping [1/s].
+        files: what the stage is made of.
     """
 
     bodies: tuple[StageBody, ...]
@@ -102,3 +103,4 @@ class StageScene:
     fps: float
     frames: int | None
     damping: float
+    files: tuple[str, ...]

@@ -66,7 +66,8 @@ def stage_scene(path: str) -> StageScene:
             _warn_of_bodies_that_collide(view, [stage.GetPrimAtPath(body.place.path) for body in bodies])
         _warn_of_the_unknown(view)
         fps, frames = _clock(stage, path)
-    return StageScene(bodies, gravity, obstacles, str(UsdGeom.GetStageUpAxis(stage)), fps, frames, damping)
+        files = tuple(sorted({layer.realPath for layer in stage.GetUsedLayers() if layer.realPath}))
+    return StageScene(bodies, gravity, obstacles, str(UsdGeom.GetStageUpAxis(stage)), fps, frames, damping, files)
 
 
 def _what_is_there(view: StageView) -> str:

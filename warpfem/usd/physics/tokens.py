@@ -18,6 +18,8 @@ MODEL = "warpfem:material"
 """Token of a material: the name of a model in ``warpfem.MATERIALS``."""
 DAMPING = "warpfem:damping"
 """Double of a physics scene: mass-proportional damping [1/s]."""
+STIFFNESS = "warpfem:stiffness"
+"""Double of a collider: pressure per depth of penetration [Pa/m]."""
 NOT_HERE = "warpfem:notInStage"
 """String of a body: what the scene that wrote it had, and UsdPhysics has no words for."""
 
