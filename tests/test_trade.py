@@ -415,6 +415,8 @@ def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, ca
         table = list(csv.DictReader(file))
     assert [row["failure"] != "" for row in table] == [record["failure"] != "" for record in data["settings"]]
     assert float(table[0]["error_l2"]) == data["settings"][0]["errors"]["l2"]
+    assert [row["axis_cells"] for row in table] == [record["setting"]["cells"] for record in data["settings"]]
+    assert int(table[0]["cells"]) == data["settings"][0]["cells"] == 4  # those of the mesh of cells=1
     for name in ("trade.png", "trade.svg"):
         assert (out / name).stat().st_size > 10_000
     lines = (out / "runs.jsonl").read_text().count("\n")
