@@ -244,6 +244,34 @@ def test_a_setting_counts_as_within_an_error_by_its_bound():
     assert answer(ordered, own, "l2", 0.01).candidate.seconds == 2.0
 
 
+@pytest.mark.parametrize(
+    ("errors", "target", "within", "told"),
+    [
+        ((0.2, 0.05, 0.0009), 0.02, True, False),  # the last may be within 0.2 % or not
+        ((0.2, 0.05, 0.0095), 0.01, False, False),  # likewise within 1 %
+        ((0.2, 0.05, 0.02), 0.01, False, True),
+        ((0.2, 0.05, 0.02), 0.03, True, True),
+    ],
+)
+def test_the_next_factor_costs_more_than_the_answer_or_is_not_told(errors, target, within, told):
+    own = reference(2e-3)
+    ordered = candidates([point(error, 2.0**k) for k, error in enumerate(errors)], own, "l2")
+    found = answer(ordered, own, "l2", target)
+    assert (found.candidate is not None, found.next_seconds is not None) == (within, told)
+    assert found.next_seconds is None or found.next_seconds > 4.0
+    assert told or "the front does not tell" in found.sentence
+
+
+def test_an_error_of_nothing_is_no_part_of_a_power_law():
+    own = reference(0.0)
+    exact = Point(Setting(), (Outcome(seconds=[50.0], times=np.arange(1.0), motion=np.full((1, 1, 1), 1.0)),))
+    ordered = candidates([point(0.2, 1.0), point(0.05, 2.0), exact], own, "l2")
+    assert answer(ordered, own, "l2", 0.01).next_seconds == 50.0
+    own = reference(1e-4)
+    none = answer(candidates([point(0.2, 1.0), point(0.05, 2.0), exact], own, "l2"), own, "l2", 5e-4)
+    assert (none.candidate.seconds, none.next_seconds) == (50.0, None)
+
+
 # ---- studies
 
 

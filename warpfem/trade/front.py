@@ -169,7 +169,15 @@ def advice(reference: Reference, name: str) -> str:
 
 
 def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
-    """The time at which the front, continued as a power law from its last part, comes to an error [s]."""
+    """The time at which the front, continued as a power law from its last part, comes to an error [s].
+
+    ``None`` if the front does not tell: errors that the reference does not resolve follow no power law, and where one
+    of them may be within the goal, others need not be looked for beyond.
+    """
+    resolved = [own for own in edge if own.resolved]
+    if not resolved or edge[-1].error <= goal:
+        return None
+    edge = resolved
     tail = [own for own in edge if own.error <= TAIL * edge[-1].error]
     tail = tail if len(tail) >= LEAST_TAIL else list(edge[-LEAST_TAIL:])
     if len(tail) < 2:
