@@ -460,6 +460,8 @@ def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, ca
         (["trade", "missing.py"], "no scene file"),
         (["trade", "bar.py", "--axis", "cels=1"], "did you mean 'cells'"),
         (["trade", "bar.py", "--quantity", "tipp"], "there is no quantity 'tipp'"),
+        (["trade", "bar.py", "--set", "cells=few"], "cells must be of type int, like 2, not 'few'"),
+        (["trade", "bar.py", "--set", "dt=1/48"], "dt must be of type float"),
     ],
 )
 def test_wrong_use_is_said_before_anything_is_run(bar, tmp_path, monkeypatch, capsys, arguments, message):
