@@ -420,6 +420,13 @@ def test_nothing_is_measured_where_nothing_moves(bar, tmp_path, in_process):
         build_reference(own, mesh_control(own.problem), own.run([Setting()]))
 
 
+def test_errors_are_not_relative_to_nothing(bar, tmp_path, in_process):
+    bar.write_text(BAR.replace('{"tip": tip}', '{"nothing": lambda motion: 0.0}'))
+    own = study(bar, tmp_path / "a", Here())
+    with pytest.raises(SimulationError, match="the reference has 0 for 'nothing'"):
+        build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)]), "nothing")
+
+
 def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, capsys):
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"

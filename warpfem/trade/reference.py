@@ -105,7 +105,7 @@ def build_reference(
         explicit: whether its runs take explicit steps; ``None`` as the scene does.
 
     Raises:
-        SimulationError: no ladder of two levels could be run, or the quantity has no value.
+        SimulationError: no ladder of two levels could be run, or the quantity has no value, or that of 0.
     """
     if explicit is None:
         explicit = not isinstance(study.scene.solver, ImplicitSolver)
@@ -137,6 +137,8 @@ class _Builder:
             parts = reference.parts.get(name)
             if parts is None:
                 raise SimulationError(f"the reference has no value of '{name}': it has {', '.join(reference.names)}")
+            if not reference.scales[name] > 0.0:
+                raise SimulationError(f"the reference has 0 for '{name}': no error is relative to that")
             best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
             need = max(best, least) / MARGIN if within is None else within
             growths = {"space": self._grow_mesh}
