@@ -477,6 +477,12 @@ def test_wrong_use_is_said_before_anything_is_run(bar, tmp_path, monkeypatch, ca
     assert message in capsys.readouterr().err
 
 
+def test_quantities_are_not_called_as_norms_are(bar, tmp_path, capsys):
+    bar.write_text(BAR.replace('"tip": tip', '"max": tip'))
+    assert main(["trade", str(bar), "--out", str(tmp_path / "out")]) == WRONG_USE
+    assert "a quantity cannot be called 'max'" in capsys.readouterr().err
+
+
 def test_a_study_whose_every_setting_fails_says_so(bar, tmp_path, in_process, capsys):
     assert main(["trade", str(bar), "--axis", "element=cubic", "--out", str(tmp_path / "out")]) == FAILED
     assert "No reference: there is no reference: every setting failed" in capsys.readouterr().out
