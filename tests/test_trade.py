@@ -331,6 +331,17 @@ def test_runs_are_those_of_the_scene_and_of_what_it_imports(bar, tmp_path):
     assert Problem.of(bar).key(Setting()) == before
 
 
+def test_motions_are_compared_at_the_same_places_though_meshes_come_out_different(bar, tmp_path):
+    shuffled = "    mesh = replace(mesh, cells=np.random.default_rng().permutation(mesh.cells))\n    bar ="
+    bar.write_text("from dataclasses import replace\nimport numpy as np\n" + BAR.replace("    bar =", shuffled))
+    first = study(bar, tmp_path / "a", Here())
+    again = study(bar, tmp_path / "a", Here())
+    assert (again.scene.bodies[0].mesh.cells != first.scene.bodies[0].mesh.cells).any()
+    for other in (again, first.shortened(3), first.alone()):
+        np.testing.assert_array_equal(other.places, first.places)
+    assert (study(bar, tmp_path / "b", Here()).places[0] != first.places[0]).any()
+
+
 def test_times_under_load_are_not_mixed_with_others(bar, tmp_path, monkeypatch):
     monkeypatch.setattr("warpfem.trade.study.run_order", fake)
     setting = Setting.of(cells=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpfem.errors import OutputError
-from warpfem.files import replacing
+from warpfem.files import replacing, save_arrays
 from warpfem.trade.outcome import Outcome
 from warpfem.trade.problem import Problem, Setting
 
@@ -20,7 +21,8 @@ class Store:
     """The outcomes of a study, in a folder.
 
     ``runs.jsonl`` has a line for each, and ``motions/KEY.npy`` the recorded motion of each setting, that of its first
-    run without failure: all its runs have the same.
+    run without failure: all its runs have the same. ``places/KEY.npz`` has the places of each scene at which it was
+    recorded.
 
     Args:
         folder: is made if it does not exist.
@@ -34,7 +36,8 @@ class Store:
         self._lines = folder / "runs.jsonl"
         self._outcomes: dict[str, list[Outcome]] = {}
         try:
-            (folder / "motions").mkdir(parents=True, exist_ok=True)
+            for name in ("motions", "places"):
+                (folder / name).mkdir(parents=True, exist_ok=True)
             self._read()
         except OSError as error:
             raise OutputError(f"cannot use the folder {folder}: {error.strerror or error}") from None
@@ -69,6 +72,28 @@ class Store:
         except OSError as error:
             raise OutputError(f"cannot write to {self.folder}: {error.strerror or error}") from None
         self._outcomes.setdefault(key, []).append(outcome)
+
+    def places(self, problem: Problem, drawn: Callable[[], list[np.ndarray]]) -> list[np.ndarray]:
+        """The places at which all motions of a scene are recorded, those of fewer frames too.
+
+        They are kept: some meshes come out different each time that they are made, and so would the places.
+
+        Args:
+            problem: the scene and its parameters.
+            drawn: gives them for each body, if there are none yet.
+
+        Raises:
+            OutputError: they cannot be read or written.
+        """
+        key = replace(problem, frames=None, device=None).key(Setting())
+        path = self.folder / "places" / f"{key}.npz"
+        try:
+            if not path.exists():
+                save_arrays(path, {f"body_{index}": own for index, own in enumerate(drawn())})
+            with np.load(path) as arrays:
+                return [arrays[f"body_{index}"] for index in range(len(arrays.files))]
+        except OSError as error:
+            raise OutputError(f"cannot use {path}: {error.strerror or error}") from None
 
     def _motion(self, key: str) -> Path:
         return self.folder / "motions" / f"{key}.npy"

@@ -113,8 +113,11 @@ class Study:
         self.say = say
         self._executor = executor
         self.scene = problem.build(Setting()).scene
+        self.places = store.places(problem, self._spread)
+
+    def _spread(self) -> list[np.ndarray]:
         share = max(1, PLACES // len(self.scene.bodies))
-        self.places = [spread_places(body.mesh, share) for body in self.scene.bodies]
+        return [spread_places(body.mesh, share) for body in self.scene.bodies]
 
     def shortened(self, frames: int) -> Study:
         """The same study of the first frames alone."""
