@@ -331,6 +331,15 @@ def test_runs_are_those_of_the_scene_and_of_what_it_imports(bar, tmp_path):
     assert Problem.of(bar).key(Setting()) == before
 
 
+def test_all_frames_are_not_run_again_as_the_first_ones(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    runs = Here()
+    own = study(bar, tmp_path, runs)
+    for part in (own, own.shortened(own.scene.frames), own.shortened(3)):
+        part.run([Setting()])
+    assert len(runs.labels) == 2
+
+
 def test_motions_are_compared_at_the_same_places_though_meshes_come_out_different(bar, tmp_path):
     shuffled = "    mesh = replace(mesh, cells=np.random.default_rng().permutation(mesh.cells))\n    bar ="
     bar.write_text("from dataclasses import replace\nimport numpy as np\n" + BAR.replace("    bar =", shuffled))

@@ -121,6 +121,8 @@ class Study:
 
     def shortened(self, frames: int) -> Study:
         """The same study of the first frames alone."""
+        if frames == self.scene.frames:
+            return self  # its outcomes are those of all frames
         return self._like(replace(self.problem, frames=frames), self.load, self.threads)
 
     def alone(self) -> Study:
