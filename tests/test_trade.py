@@ -433,6 +433,18 @@ def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_proce
     assert 1.0 < found.parts["l2"]["time"].order < 4.0
 
 
+def test_the_steps_of_the_reference_are_not_those_of_explicit_settings(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    runs = Here()
+    own = study(bar, tmp_path, runs)
+    asked = own.run([Setting.of(cells=1, dt="1/40"), Setting.of(cells=1, solver="velocity_verlet", dt="auto")])
+    for asked_point, dt, iterations in zip(asked, (1 / 40, 1e-4), (30, 0), strict=True):
+        asked_point.first.shortest_dt = asked_point.first.longest_dt = dt
+        asked_point.first.newton_iterations = iterations
+    build_reference(own, mesh_control(own.problem), asked)
+    assert {label.rpartition("dt=")[2] for label in runs.labels[2:]} == {"1/20", "1/40", "1/80"}
+
+
 def test_nothing_is_measured_where_nothing_moves(bar, tmp_path, in_process):
     bar.write_text(BAR.replace("gravity=(0, -1)", "gravity=None"))
     own = study(bar, tmp_path / "a", Here())

@@ -173,11 +173,15 @@ class _Builder:
             raise SimulationError("there is no reference: " + "; ".join(self.remarks))
 
     def _first_steps(self) -> list[int]:
-        """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh."""
+        """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh.
+
+        They are as short as those of the implicit settings: explicit ones are shorter than their errors in time want.
+        """
         if not self.implicit:
             return [0]
         interval = 1.0 / self.study.scene.fps
-        shortest = min((p.first.shortest_dt for p in self.asked if p.first.shortest_dt > 0.0), default=interval)
+        implicit = [point.first for point in self.asked if point.first.newton_iterations > 0]
+        shortest = min((outcome.longest_dt for outcome in implicit), default=interval)
         most = max(4, 2 ** math.ceil(math.log2(max(1.0, interval / shortest) - 1e-6)))
         return [most // 4, most // 2, most]
 
