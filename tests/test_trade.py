@@ -305,6 +305,18 @@ def test_a_study_goes_on_from_what_it_has(bar, tmp_path, monkeypatch):
     assert changed.labels == ["cells=1"]
 
 
+@pytest.mark.skipif(not Path("/dev/fd").exists(), reason="tells which files are open")
+def test_motions_that_nobody_wants_are_not_open(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    settings = [Setting.of(cells=cells) for cells in range(1, 21)]
+    study(bar, tmp_path / "a", Here()).run(settings)
+    before = len(os.listdir("/dev/fd"))
+    again = study(bar, tmp_path / "a", Here())
+    points = again.run(settings[:2], 3)
+    assert len(os.listdir("/dev/fd")) <= before + 2
+    assert [outcome.motion.shape for outcome in points[1].outcomes] == [(3, 4, 2)] * 3
+
+
 def one_by_one(executor, own, settings):
     """Outcomes come while later settings are not submitted yet, as with one worker."""
     for setting in settings:

@@ -43,8 +43,22 @@ class Store:
             raise OutputError(f"cannot use the folder {folder}: {error.strerror or error}") from None
 
     def outcomes(self, problem: Problem, setting: Setting) -> list[Outcome]:
-        """All outcomes of a setting, in the order in which they came."""
-        return list(self._outcomes.get(problem.key(setting), ()))
+        """All outcomes of a setting, in the order in which they came.
+
+        Raises:
+            OutputError: their motion cannot be read.
+        """
+        key = problem.key(setting)
+        own = self._outcomes.get(key, [])
+        good = [outcome for outcome in own if not outcome.failure]
+        if any(not outcome.motion.size for outcome in good):
+            try:  # one file remains open for each setting, and none for those that are not asked for
+                motion = np.load(self._motion(key), mmap_mode="r")
+            except OSError as error:
+                raise OutputError(f"cannot read {self._motion(key)}: {error.strerror or error}") from None
+            for outcome in good:
+                outcome.motion = motion
+        return list(own)
 
     def add(self, problem: Problem, setting: Setting, outcome: Outcome) -> None:
         """Keeps an outcome.
@@ -58,7 +72,8 @@ class Store:
             if not outcome.failure and not motion.exists():
                 with replacing(motion) as temporary, open(temporary, "wb") as array:
                     np.save(array, outcome.motion)
-            record = asdict(replace(outcome, motion=np.zeros(0))) | {"times": outcome.times.tolist()}
+            kept = replace(outcome, motion=np.zeros((0, 0, 0)))  # read when it is asked for
+            record = asdict(kept) | {"times": outcome.times.tolist()}
             del record["motion"]
             line = json.dumps({"key": key, "setting": dict(setting), **record}) + "\n"
             file = os.open(self._lines, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -67,11 +82,9 @@ class Store:
                 os.fsync(file)
             finally:
                 os.close(file)
-            if not outcome.failure:
-                outcome.motion = np.load(motion, mmap_mode="r")
         except OSError as error:
             raise OutputError(f"cannot write to {self.folder}: {error.strerror or error}") from None
-        self._outcomes.setdefault(key, []).append(outcome)
+        self._outcomes.setdefault(key, []).append(kept)
 
     def places(self, problem: Problem, drawn: Callable[[], list[np.ndarray]]) -> list[np.ndarray]:
         """The places at which all motions of a scene are recorded, those of fewer frames too.
@@ -112,8 +125,6 @@ class Store:
             key = record.get("key", "")
             outcome = Outcome(**{name: value for name, value in record.items() if name in known})
             outcome.times = np.array(outcome.times)
-            if not outcome.failure:
-                if not self._motion(key).exists():
-                    continue  # somebody removed it: run it again
-                outcome.motion = np.load(self._motion(key), mmap_mode="r")
+            if not outcome.failure and not self._motion(key).exists():
+                continue  # somebody removed it: run it again
             self._outcomes.setdefault(key, []).append(outcome)
