@@ -376,6 +376,20 @@ def test_times_under_load_are_not_mixed_with_others(bar, tmp_path, monkeypatch):
     assert more.labels == []
 
 
+def test_times_of_another_machine_are_not_mixed_with_those_of_this_one(bar, tmp_path, monkeypatch):
+    settings, runs = [Setting.of(cells=2)], Here()
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    study(bar, tmp_path, runs).run(settings, 2)
+    here = study(bar, tmp_path, runs)
+    for outcome in here.store.outcomes(here.problem, settings[0]):
+        outcome.machine["processor"] = "another one"
+    here.solve(settings)  # the motion is the same on all
+    assert len(runs.labels) == 2
+    (point,) = here.run(settings)
+    assert len(runs.labels) == 3
+    assert "another one" not in {outcome.machine["processor"] for outcome in point.outcomes}
+
+
 def test_what_a_lost_worker_had_in_hand_is_submitted_again(bar, tmp_path, monkeypatch):
     monkeypatch.setattr("warpfem.trade.study.run_order", fake)
     said = []

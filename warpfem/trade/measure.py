@@ -15,7 +15,7 @@ from warpfem.errors import SceneError, SimulationError, WarpfemError, described
 from warpfem.motion import Motion
 from warpfem.simulation import Simulation, Summary
 from warpfem.threads import available_threads
-from warpfem.trade.machine import facts, peak_bytes
+from warpfem.trade.machine import peak_bytes
 from warpfem.trade.outcome import Order, Outcome
 from warpfem.trade.problem import Choice, mesh_size
 
@@ -25,7 +25,7 @@ LONG = 0.5
 
 def measure(order: Order) -> Outcome:
     """Runs a setting, once or until its rounds together are long enough to be timed."""
-    outcome = Outcome(load=order.load, machine=facts())
+    outcome = Outcome(load=order.load)
     wp.config.log_level = wp.LOG_ERROR
     try:
         with warnings.catch_warnings():

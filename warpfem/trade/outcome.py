@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from warpfem.trade.machine import facts
 from warpfem.trade.problem import Problem, Setting
 
 Load = Literal["serial", "parallel"]
@@ -58,7 +59,7 @@ class Outcome:
         linear_solver: what solved the linear systems, and why.
         quantities: the scene's quantities of interest by name.
         missing: why some of them have no value, by name.
-        machine: facts of the machine and versions.
+        machine: facts of the machine and versions: of this one, unless another is named.
         times: simulated time of the frames (frames,) [s].
         motion: displacements at the places (frames, places, dim) [m].
     """
@@ -84,6 +85,6 @@ class Outcome:
     linear_solver: str = ""
     quantities: dict[str, float] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
-    machine: dict[str, Any] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=facts)
     times: np.ndarray = field(default_factory=lambda: np.zeros(0))
     motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from warpfem.errors import OutputError, described
 from warpfem.places import spread_places
+from warpfem.trade.machine import facts
 from warpfem.trade.outcome import Load, Order, Outcome
 from warpfem.trade.problem import Problem, Setting
 from warpfem.trade.process import run_order
@@ -112,6 +113,7 @@ class Study:
         self.threads = threads
         self.say = say
         self._executor = executor
+        self._machine = facts()
         self.scene = problem.build(Setting()).scene
         self.places = store.places(problem, self._spread)
 
@@ -135,7 +137,7 @@ class Study:
     def run(self, settings: Sequence[Setting], repeats: int = 1) -> list[Point]:
         """Runs settings, round after round, so that slow changes of the machine's speed show in the spread.
 
-        Outcomes that the store has, of the same load, are not run again.
+        Outcomes that the store has, of the same load and machine, are not run again.
 
         Args:
             settings: the settings.
@@ -152,7 +154,7 @@ class Study:
         return [Point(setting, tuple(self._own(setting))) for setting in settings]
 
     def solve(self, settings: Sequence[Setting]) -> list[Point]:
-        """As :meth:`run`, once, for the motion alone: an outcome of any load will do."""
+        """As :meth:`run`, once, for the motion alone: an outcome of any load and machine will do."""
         known = {s: [o for o in self.store.outcomes(self.problem, s) if not o.failure] for s in settings}
         self._run_missing([setting for setting, outcomes in known.items() if not outcomes], 1, 1)
         return [Point(s, tuple(known[s] or self._own(s))) for s in settings]
@@ -166,8 +168,12 @@ class Study:
             self.say(f"{setting.label}: {told}")
 
     def _own(self, setting: Setting) -> list[Outcome]:
-        """The outcomes that count for a setting: those of the study's load."""
-        return [o for o in self.store.outcomes(self.problem, setting) if o.load == self.load]
+        """The outcomes that count for a setting: those of the study's load, and of this machine if it is serial."""
+        own = [o for o in self.store.outcomes(self.problem, setting) if o.load == self.load]
+        return own if self.load == "parallel" else [o for o in own if self._is_of_this_machine(o)]
+
+    def _is_of_this_machine(self, outcome: Outcome) -> bool:
+        return all(outcome.machine.get(name) == self._machine[name] for name in ("processor", "cores"))
 
     def _lacks(self, setting: Setting, count: int) -> bool:
         own = self._own(setting)
