@@ -402,6 +402,15 @@ def test_what_a_lost_worker_had_in_hand_is_submitted_again(bar, tmp_path, monkey
         study(bar, tmp_path, lost).run([Setting.of(cells=3)])
 
 
+def test_a_cluster_that_is_gone_is_a_clear_error(bar, tmp_path):
+    class Gone(Executor):
+        def submit(self, function, order):
+            raise RuntimeError("no scheduler")
+
+    with pytest.raises(OutputError, match="3 workers were lost, the last with RuntimeError: no scheduler"):
+        study(bar, tmp_path, Gone()).run([Setting()])
+
+
 def test_failures_are_results(bar, tmp_path):
     """A crash, a hang, an end, a scene that is no scene, and steps that are too long."""
     actions = {

@@ -188,7 +188,7 @@ class Study:
             for setting in settings
         }
         futures: dict[Future[Outcome], tuple[Setting, int]] = {
-            self._executor.submit(run_order, order): (setting, 1) for setting, order in orders.items()
+            self._submit(order): (setting, 1) for setting, order in orders.items()
         }
         while futures:
             done, _ = wait(futures, return_when=FIRST_COMPLETED)
@@ -203,9 +203,18 @@ class Study:
                             "came before is kept, and the same command goes on"
                         ) from None
                     self.say(f"{setting.label}: a worker was lost ({described(error)}), submitted again")
-                    futures[self._executor.submit(run_order, orders[setting])] = setting, submitted + 1
+                    futures[self._submit(orders[setting])] = setting, submitted + 1
                     continue
                 yield setting, outcome
+
+    def _submit(self, order: Order) -> Future[Outcome]:
+        """What comes of an order; an executor that takes none, as when its cluster is gone, has lost it."""
+        try:
+            return self._executor.submit(run_order, order)
+        except Exception as error:
+            lost: Future[Outcome] = Future()
+            lost.set_exception(error)
+            return lost
 
 
 @dataclass(frozen=True)
