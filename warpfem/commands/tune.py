@@ -41,8 +41,9 @@ def execute(arguments: argparse.Namespace) -> int:
     it to a file that `warpfem run SCENE --settings FILE` takes.
 
     Settings are tried on the first half of the frames, and what is found is verified on the others, against a reference
-    that is finer in space and time; without one that is accurate enough the search is refused, with exit code 1. Runs
-    are kept in output/SCENE.trade, where those of `warpfem trade` are, and not repeated.
+    that is finer in space and time; of a quantity, which is a number of the whole motion, on all frames. Without a
+    reference that is accurate enough the search is refused, with exit code 1. Runs are kept in output/SCENE.trade,
+    where those of `warpfem trade` are, and not repeated.
     """
     from warpfem.trade import tuning_report
     from warpfem.trade.axes import mesh_control
