@@ -119,6 +119,7 @@ def test_a_setting_makes_its_scene(bar):
     assert scene(cells=4).bodies[0].mesh.cell_count == 64
     assert scene(dt="1/80").dt == 1 / 80
     assert scene(dt="auto").dt == "auto"  # although the parameter is a number
+    assert scene(dt="auto", **{"scene.dt": "1/80"}).dt == 1 / 80  # as the halved steps that separate errors
     assert scene(element="P2").bodies[0].mesh.order == 2
     assert scene(refine=1).bodies[0].mesh.cell_count == 4 * plain.bodies[0].mesh.cell_count
     swapped = scene(material="NeoHookean").bodies[0].material
@@ -145,12 +146,12 @@ def test_the_parameters_that_set_the_mesh_are_found(bar, tmp_path):
     assert mesh.names == {"cells", "refine"}
     assert mesh.finer(Setting(), 2.0) == Setting.of(cells=4)
     assert mesh.finer(Setting.of(cells=1), 0.5) is None
-    assert [kind_of(name, mesh) for name in ("cells", "dt", "dtype", "scene.tolerance", "E", "material")] == [
+    assert [kind_of(name, mesh) for name in ("cells", "dt", "dtype", "scene.tolerance", "line_search", "E")] == [
         "space",
         "time",
         "algebra",
         "algebra",
-        "model",
+        "algebra",
         "model",
     ]
     path = tmp_path / "by_length.py"

@@ -13,13 +13,13 @@ from warpfem.errors import SceneError, WarpfemError
 from warpfem.scene import Scene
 from warpfem.scene_file import scene_parameters, value_of
 from warpfem.solvers.implicit import ImplicitSolver
-from warpfem.trade.problem import FORCED, Problem, Setting, require_known
+from warpfem.trade.problem import FORCED, SOLVER_FIELDS, Problem, Setting, require_known
 
 Kind = Literal["space", "time", "algebra", "model"]
 
 SPACE = ("element", "refine")
 TIME = ("dt", "solver", "error")
-ALGEBRA = ("tolerance", "linear_tolerance", "dtype", "max_iterations", "linear_iterations", "linear_solver")
+ALGEBRA = ("dtype", *(name for name in SOLVER_FIELDS if name not in TIME))
 """Axes whose names say which error they bear on, if they are not parameters that change the mesh."""
 
 CLEARLY_MORE = 1.5
