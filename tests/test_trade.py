@@ -231,6 +231,9 @@ def test_the_front_and_its_answers():
     assert one.next_how == "extrapolated"
     assert one.next_seconds > 400.0
     assert "it is within that, too" in answer(candidates([point(0.001, 3.0)], own, "l2"), own, "l2", 0.1).sentence
+    slow = answer(candidates([point(0.2, 123.0), point(0.01, 1234.0)], own, "l2"), own, "l2", 0.25)
+    assert "123 s (123 to 123 s), off by 20 %" in slow.sentence
+    assert "the next factor of 10: 1234 s (measured), 10 times as much" in slow.sentence
     none = answer(ordered, own, "l2", 5e-4)
     assert none.candidate is None
     assert "No setting of the sweep is within 0.05 %" in none.sentence
