@@ -555,7 +555,11 @@ def test_quantities_are_not_called_as_norms_are(bar, tmp_path, capsys):
 
 
 def test_a_study_whose_every_setting_fails_says_so(bar, tmp_path, in_process, capsys):
-    assert main(["trade", str(bar), "--axis", "element=cubic", "--out", str(tmp_path / "out")]) == FAILED
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "trade.png").write_text("of the study before")
+    assert main(["trade", str(bar), "--axis", "element=cubic", "--out", str(out)]) == FAILED
+    assert not (out / "trade.png").exists()
     assert "No reference: there is no reference: every setting failed" in capsys.readouterr().out
 
 
