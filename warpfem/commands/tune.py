@@ -74,7 +74,8 @@ def execute(arguments: argparse.Namespace) -> int:
 
 def _tune_command(arguments: argparse.Namespace) -> str:
     """The command as one would write it, without what does not bear on its result."""
-    given = [f"--set {text}" for text in arguments.parameters]
-    given += [] if arguments.frames is None else [f"--frames {arguments.frames}"]
-    given += [] if arguments.quantity == "l2" else [f"--quantity {shlex.quote(arguments.quantity)}"]
-    return " ".join(["warpfem tune", str(arguments.scene), f"--error {arguments.error:g}", *given])
+    words = ["warpfem", "tune", str(arguments.scene), "--error", f"{arguments.error:g}"]
+    words += [word for text in arguments.parameters for word in ("--set", text)]
+    words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]
+    words += [] if arguments.quantity == "l2" else ["--quantity", arguments.quantity]
+    return shlex.join(words)
