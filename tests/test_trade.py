@@ -445,8 +445,9 @@ def test_failures_are_results(bar, tmp_path):
 def test_only_failures_that_may_go_away_are_run_again(bar, tmp_path, monkeypatch):
     failures = {"1": Outcome("crashed"), "2": Outcome("killed", by_chance=True), "3": Outcome("late", limit=5.0)}
     monkeypatch.setattr("warpfem.trade.study.run_order", lambda order: failures[order.setting["cells"]])
-    settings = [Setting.of(cells=cells) for cells in failures]
-    study(bar, tmp_path, Here(), limit=5.0).run(settings)
+    settings, once = [Setting.of(cells=cells) for cells in failures], Here()
+    study(bar, tmp_path, once, limit=5.0).run(settings, 3)
+    assert once.labels == ["cells=1", "cells=2", "cells=3"]
     monkeypatch.setattr("warpfem.trade.study.run_order", fake)
     again, longer = Here(), Here()
     points = study(bar, tmp_path, again, limit=5.0).run(settings)

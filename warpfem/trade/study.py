@@ -114,6 +114,7 @@ class Study:
         self.say = say
         self._executor = executor
         self._machine = facts()
+        self._given_up: set[Setting] = set()
         self.scene = problem.build(Setting()).scene
         self.places = store.places(problem, self._spread)
 
@@ -164,6 +165,8 @@ class Study:
         missing = [setting for setting in dict.fromkeys(settings) if self._lacks(setting, count)]
         for setting, outcome in self._run_each(missing, rounds):
             self.store.add(self.problem, setting, outcome)
+            if outcome.by_chance:
+                self._given_up.add(setting)  # until the study is taken up again
             told = outcome.failure or f"{statistics.median(outcome.seconds):.3g} s of steps"
             self.say(f"{setting.label}: {told}")
 
@@ -179,7 +182,7 @@ class Study:
         own = self._own(setting)
         good = sum(not outcome.failure for outcome in own)
         for_good = [o for o in own if o.failure and not o.by_chance and not 0.0 < o.limit < self.limit]
-        return good < count and not for_good
+        return good < count and not for_good and setting not in self._given_up
 
     def _run_each(self, settings: Sequence[Setting], rounds: int) -> Iterator[tuple[Setting, Outcome]]:
         """Outcomes as they come; what a lost worker had in hand is submitted again."""
