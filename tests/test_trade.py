@@ -457,6 +457,14 @@ def test_only_failures_that_may_go_away_are_run_again(bar, tmp_path, monkeypatch
     assert longer.labels == ["cells=3"]
 
 
+def test_a_scene_that_was_edited_meanwhile_is_no_failure_of_its_settings(bar):
+    order = Order(Problem.of(bar), Setting(), [np.array([[1.0, 0.5]])], 1, 100.0, "serial")
+    bar.write_text(BAR + "# edited")
+    outcome = measure(order)
+    assert "not the file that the study was begun with" in outcome.failure
+    assert outcome.by_chance  # once that is undone it is run again
+
+
 def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_process):
     own = study(bar, tmp_path / "a", Here())
     settings = [Setting.of(cells=1, element="P2", dt="1/20"), Setting.of(cells=2, element="P1", dt="1/20")]

@@ -41,7 +41,9 @@ def measure(order: Order) -> Outcome:
 
 def _measure(order: Order, outcome: Outcome) -> None:
     problem = order.problem
+    outcome.by_chance = True
     problem.require_same_file()
+    outcome.by_chance = False  # what fails from here on fails again
     choice = problem.build(order.setting)
     threads = order.threads or available_threads()
     with _kernel_seconds() as seconds:

@@ -45,7 +45,8 @@ class Outcome:
         failure: why there is no result; empty if there is one.
         load: whether other runs of the study ran at the same time.
         limit: the wall time that was not enough, if that is why [s].
-        by_chance: whether the failure is one of the machine, such as a process that was killed.
+        by_chance: whether the failure is none of the setting's, such as a process that was killed, or a scene file
+            that was not there or had been edited meanwhile.
         seconds: wall time of the steps of each round [s].
         setup_seconds: wall time to build the model, without its kernels [s].
         kernel_seconds: wall time to compile kernels, or to load those compiled before [s].
