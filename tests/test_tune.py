@@ -1,6 +1,7 @@
 """Tuning: the search for the cheapest setting within an error, and the files of settings."""
 
 import json
+import shlex
 import tomllib
 import zlib
 from concurrent.futures import Executor, Future
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.cli import main
+from warpfem.cli import main, parser
 from warpfem.commands.session import FAILED, OK, WRONG_USE
+from warpfem.commands.tune import _tune_command
 from warpfem.errors import SceneError, SimulationError
 from warpfem.motion import Motion
 from warpfem.solvers.implicit import ImplicitSolver
@@ -267,6 +269,11 @@ def test_the_command_writes_settings_that_run_takes(bar, tmp_path, monkeypatch, 
     printed = capsys.readouterr()
     assert "The cheapest setting found within 2 % of the motion (L2)" in printed.out
     assert "which the search has not seen" in printed.out and "s of steps" not in printed.err
+
+
+def test_the_command_that_a_file_tells_of_can_be_given_again(tmp_path):
+    words = ["tune", str(tmp_path / "my bar.py"), "--error", "0.02", "--set", "kind=a b", "--quantity", "tip sag"]
+    assert shlex.split(_tune_command(parser().parse_args(words))) == ["warpfem", *words]
 
 
 @pytest.mark.parametrize(
