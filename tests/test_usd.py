@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdValidation, Vt
 
-from warpfem.boundary import BoxWalls, Plane, Sphere
+from warpfem.boundary import Box, BoxWalls, Plane, Sphere
 from warpfem.errors import MeshError, OutputError
 from warpfem.mesh import Mesh
 from warpfem.usd import (
@@ -33,8 +33,18 @@ from warpfem.usd import (
 
 REPOSITORY = Path(__file__).parent.parent
 OBSTACLES = {
-    2: (Plane((0.0, -1.0), (0.3, 1.0)), Sphere((2.0, 0.0), 0.5), BoxWalls((-1.0, -1.0), (3.0, 3.0))),
-    3: (Plane((0, -1, 0), (0, 1, 0.2)), Sphere((2, 0, 0), 0.5), BoxWalls((-1, -1, -1), (3, 3, 3))),
+    2: (
+        Plane((0.0, -1.0), (0.3, 1.0)),
+        Sphere((2.0, 0.0), 0.5),
+        Box((2.0, 1.0), (0.5, 0.3), ((1.0, 1.0), (1.0, -1.0))),
+        BoxWalls((-1.0, -1.0), (3.0, 3.0)),
+    ),
+    3: (
+        Plane((0, -1, 0), (0, 1, 0.2)),
+        Sphere((2, 0, 0), 0.5),
+        Box((2, 1, 0), (0.5, 0.3, 0.2), ((1, 1, 0), (1, -1, 0), (0, 0, 1))),
+        BoxWalls((-1, -1, -1), (3, 3, 3)),
+    ),
 }
 SETUPS = [pytest.param(2, id="2D"), pytest.param(3, id="3D")]
 
@@ -288,17 +298,66 @@ def test_read_animation_gives_back_what_was_written(tmp_path: Path, dim: int) ->
             assert np.array_equal(frame.points, lifted(frames[index][number].points).astype(np.float32))
             assert frame.von_mises == pytest.approx(frames[index][number].von_mises, rel=1e-6)
             assert frame.jacobian == pytest.approx(frames[index][number].jacobian, rel=1e-6)
-            assert frame.colors.shape == frame.points.shape
     for index in (-1, 4):
         with pytest.raises(IndexError):
             animation.frame(index)
+
+
+def test_an_output_is_a_mesh_again(tmp_path: Path) -> None:
+    body = make_body(3)
+    write(tmp_path / "run.usdc", [body], 2, obstacles=OBSTACLES[3])
+    mesh = read_mesh(tmp_path / "run.usdc")
+    assert np.array_equal(mesh.cells, body.cells)
+    assert np.array_equal(mesh.points, body.rest_points.astype(np.float32))
+
+
+@pytest.mark.parametrize("dim", SETUPS)
+def test_scalars_of_a_surface_are_read_at_the_corners_of_its_faces(tmp_path: Path, dim: int) -> None:
+    body = make_body(dim)
+    write(tmp_path / "run.usdc", [body], 2)
+    stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
+    surface = UsdGeom.Mesh.Get(stage, "/World/block/block_surface")
+    faces = np.array(surface.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    point_count = len(surface.GetPointsAttr().Get(0))
+    primvars, tokens = UsdGeom.PrimvarsAPI(surface), UsdGeom.Tokens
+    expected = {}
+    for interpolation, count, pick in (
+        (tokens.constant, 1, lambda values: np.full(faces.shape, values[0])),
+        (tokens.uniform, len(faces), lambda values: np.repeat(values[:, None], 3, axis=1)),
+        (tokens.vertex, point_count, lambda values: values[faces]),
+        (tokens.varying, point_count, lambda values: values[faces]),
+        (tokens.faceVarying, faces.size, lambda values: values.reshape(faces.shape)),
+    ):
+        name = f"by_{interpolation}"
+        primvar = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.DoubleArray, interpolation)
+        for index in range(2):
+            primvar.Set(np.arange(count) + 0.5 + index, index)
+        expected[name] = pick(np.arange(count) + 0.5)
+    indexed = primvars.CreatePrimvar("indexed", Sdf.ValueTypeNames.HalfArray, tokens.uniform)
+    indexed.Set([3.0, 4.0])
+    indexed.SetIndices([face % 2 for face in range(len(faces))])
+    short = primvars.CreatePrimvar("short", Sdf.ValueTypeNames.IntArray, tokens.vertex)
+    short.Set([1, 2])
+    stage.Save()
+    animation = read_animation(tmp_path / "run.usdc")
+    assert set(animation.primvars) == {*expected, "indexed", "short", "J", "JPoint", "vonMises", "vonMisesPoint"}
+    for index in range(2):
+        for name, values in expected.items():
+            (read,) = animation.surface_values(name, index)
+            assert np.array_equal(read, values + index), name
+        (read,) = animation.surface_values("indexed", index)
+        assert np.array_equal(read[:, 0], 3.0 + np.arange(len(faces)) % 2)
+    with pytest.raises(
+        OutputError, match="lacks primvars:short of /World/block/block_surface at 0, one number for each"
+    ):
+        animation.surface_values("short", 0)
 
 
 @pytest.mark.parametrize("dim", SETUPS)
 def test_obstacles_are_where_they_act(tmp_path: Path, dim: int) -> None:
     body = make_body(dim)
     write(tmp_path / "run.usdc", [body], 0, obstacles=OBSTACLES[dim])
-    plane, sphere, walls = read_animation(tmp_path / "run.usdc").obstacles
+    plane, sphere, box, walls = read_animation(tmp_path / "run.usdc").obstacles
     declared = OBSTACLES[dim]
     distances = (plane[0][:, :dim] - declared[0].point) @ declared[0].normal
     assert distances.max() == pytest.approx(0.0, abs=1e-6)
@@ -306,17 +365,19 @@ def test_obstacles_are_where_they_act(tmp_path: Path, dim: int) -> None:
     assert np.ptp(plane[0], axis=0).max() > 3.5
     radii = np.linalg.norm(sphere[0][:, :dim] - declared[1].center, axis=1)
     assert radii == pytest.approx(0.5, abs=1e-6)
-    inside = (walls[0][:, :dim] > np.array(declared[2].lower) + 1e-6) & (
-        walls[0][:, :dim] < np.array(declared[2].upper) - 1e-6
+    inside = (walls[0][:, :dim] > np.array(declared[3].lower) + 1e-6) & (
+        walls[0][:, :dim] < np.array(declared[3].upper) - 1e-6
     )
     assert not inside.all(axis=1).any()
     assert walls[0][:, :dim].min() < -1.0 and walls[0][:, :dim].max() > 3.0
+    assert np.abs((box[0][:, :dim] - declared[2].center) @ declared[2].shape.T) == pytest.approx(1.0, abs=1e-5)
     if dim == 2:
-        assert all((points[:, 2] < 0.0).all() for points, _ in (plane, sphere, walls))
+        assert all((points[:, 2] < 0.0).all() for points, _ in (plane, sphere, box, walls))
     else:
-        corners = sphere[0][sphere[1]]
-        areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert (np.einsum("ij,ij->i", areas, corners.mean(axis=1) - declared[1].center) > 0.0).all()
+        for (points, triangles), own in ((sphere, declared[1]), (box, declared[2])):
+            corners = points[triangles]
+            areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            assert (np.einsum("ij,ij->i", areas, corners.mean(axis=1) - own.center) > 0.0).all()
 
 
 def test_colors_have_one_range_for_the_whole_run(tmp_path: Path) -> None:
@@ -665,7 +726,7 @@ def test_a_disk_without_room_is_said_at_once(tmp_path: Path, monkeypatch) -> Non
     left.write_frame([make_frame(body, 0)])
     before = {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()}
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr("warpfem.usd.writer.shutil.disk_usage", lambda folder: usage._replace(free=int(0.7 * needed)))
+    monkeypatch.setattr("warpfem.usd.frames.shutil.disk_usage", lambda folder: usage._replace(free=int(0.7 * needed)))
     with pytest.raises(OutputError, match=r"its 40 frames need \d[\d.]* MB .* has \d[\d.]* MB free: take another"):
         UsdWriter(path, [body], fps=24, expected_frames=40)
     assert {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()} == before

@@ -16,10 +16,12 @@ EXTRAS = {
     "pytetwild": "tet",
     "matplotlib": "plot",
     "pillow": "plot",
+    "imageio-ffmpeg": "video",
     "tqdm": "progress",
     "scipy": "bench",
     "scikit-fem": "bench",
     "distributed": "cluster",
+    "newton": "newton",
 }
 """Optional packages and the extra that brings them."""
 

@@ -83,13 +83,14 @@ def stated_up_axis(stage: Usd.Stage) -> Literal["Y", "Z"] | None:
     return "Z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "Y"
 
 
-def world_matrix(prim: Usd.Prim) -> np.ndarray:
-    """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres.
-
-    The stage's unit counts where the file states one; where it does not, numbers are metres.
-    """
-    stage = prim.GetStage()
+def metres_per_unit(stage: Usd.Stage) -> float:
+    """The stage's unit of length [m]; where the file states none, numbers are metres."""
     stated = stage.HasAuthoredMetadata(UsdGeom.Tokens.metersPerUnit)
+    return UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
+
+
+def world_matrix(prim: Usd.Prim) -> np.ndarray:
+    """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres."""
     matrix = np.array(UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim))
-    matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
+    matrix[:, :3] *= metres_per_unit(prim.GetStage())
     return matrix
