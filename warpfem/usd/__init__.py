@@ -1,8 +1,9 @@
 """Animations and meshes in USD: the only part of warpfem that imports ``pxr``.
 
 :class:`UsdWriter` stores a run frame by frame, in a thread as a :class:`BackgroundWriter`;
-:func:`read_animation` reads it back, and :func:`read_tet_mesh` and :func:`read_surface_mesh` take meshes
-from files that others made. All of them speak numpy; none knows of Warp, models or solvers.
+:func:`read_animation` reads it back, and :func:`read_pictured_stage` any stage for pictures;
+:func:`read_tet_mesh` and :func:`read_surface_mesh` take meshes from files that others made. All of them speak
+numpy; none knows of Warp, models or solvers.
 """
 
 from warpfem.usd.animation import AnimatedBody, AnimatedFrame, Animation, read_animation
@@ -10,6 +11,7 @@ from warpfem.usd.background import BackgroundWriter
 from warpfem.usd.bodies import BodyFrame, UsdBody
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
 from warpfem.usd.meshes import read_surface_mesh, read_tet_mesh
+from warpfem.usd.pictured import PicturedStage, Standing, SurfaceFrame, read_pictured_stage
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter, check_path
 
@@ -21,11 +23,15 @@ __all__ = [
     "BodyFrame",
     "ColorQuantity",
     "ColorScale",
+    "PicturedStage",
+    "Standing",
+    "SurfaceFrame",
     "UsdBody",
     "UsdWriter",
     "check_path",
     "partial_path",
     "read_animation",
+    "read_pictured_stage",
     "read_surface_mesh",
     "read_tet_mesh",
     "spread_of",

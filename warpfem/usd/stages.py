@@ -76,13 +76,24 @@ def at_rest(attribute: Usd.Attribute) -> Any:
     return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
 
 
-def world_matrix(prim: Usd.Prim) -> np.ndarray:
+def read_attributes(prim: Usd.Prim, time: float) -> None:
+    """Reads all that is written of a prim at a time, to see whether the USD library bears it."""
+    for attribute in prim.GetAuthoredAttributes():
+        attribute.Get(time)
+
+
+def world_matrix(prim: Usd.Prim, time: float | Usd.TimeCode | None = None) -> np.ndarray:
     """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres.
 
     The stage's unit counts where the file states one; where it does not, numbers are metres.
+
+    Args:
+        prim: the prim.
+        time: when; ``None`` for the earliest time.
     """
     stage = prim.GetStage()
     stated = stage.HasAuthoredMetadata(UsdGeom.Tokens.metersPerUnit)
-    matrix = np.array(UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim))
+    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime() if time is None else time)
+    matrix = np.array(cache.GetLocalToWorldTransform(prim))
     matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
     return matrix
