@@ -39,6 +39,8 @@ def Xform "set" {
         point3f[] points.timeSamples = { 10: [(0, 0, 0), (1, 0, 0), (0, 1, 0)], 11: [(0, 0, 0), (1, 0, 0), (0, 1, 1)] }
     }
 }
+def Mesh "empty" {
+}
 def Mesh "ground" {
     int[] faceVertexCounts = [4]
     int[] faceVertexIndices = [0, 1, 2, 3]
@@ -132,6 +134,36 @@ def test_a_stage_of_others_is_drawn(tmp_path: Path) -> None:
     assert colored.mean() > 0.005 and not magenta.any()
     with pytest.raises(OutputError, match="nothing named 'speed' to colour by: it has heat, displacement"):
         preview(path, tmp_path / "out.png", color="speed")
+
+
+SOLIDS = """
+def Plane "floor" {
+    uniform token axis = "%s"
+}
+def Cube "block" {
+    double size = 3
+    double3 xformOp:scale = (%s, 2, 1)
+    double3 xformOp:translate = (100, 0, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+}
+def Sphere "ball" {
+    double radius = 50
+}
+def Cone "cone" {
+}
+"""
+
+
+@pytest.mark.parametrize(("axis", "scale"), [("X", 1), ("Y", -1), ("Z", 1)])
+def test_solids_stand_where_they_are(tmp_path: Path, axis: str, scale: int) -> None:
+    stage = read_pictured_stage(write(tmp_path, STAGE + SOLIDS % (axis, scale)))
+    _, floor, block, ball = stage.standing
+    assert [own.is_plane for own in stage.standing] == [False, True, False, False]
+    a, b, c = floor.corners.transpose(1, 0, 2)
+    assert np.cross(b - a, c - a)[:, "XYZ".index(axis)] == pytest.approx([4e-4, 4e-4])  # a square of 2 cm
+    for own, volume, middle in ((block, 54e-6, (1.0, 0.0, 0.0)), (ball, 4 / 3 * np.pi * 0.125, (0.0, 0.0, 0.0))):
+        assert np.linalg.det(own.corners - middle).sum() / 6 == pytest.approx(volume, rel=0.02)  # outward
+        assert 0.5 * (own.corners.min(axis=(0, 1)) + own.corners.max(axis=(0, 1))) == pytest.approx(middle, abs=1e-9)
 
 
 @pytest.mark.parametrize(

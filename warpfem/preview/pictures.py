@@ -38,7 +38,7 @@ def preview(
 
     Args:
         path: what a run or a static solve wrote, finished or partial, or any stage with meshes whose points move: of
-            such a stage meshes are drawn, and no other shapes.
+            such a stage meshes, planes, cubes and spheres are drawn.
         out: the file to write. ``.png``: a sheet of evenly spaced frames, first and last included. ``.gif`` and
             ``.mp4``: the motion in real time, without the frames that would be too many or too short; runs of less
             than a second are slowed down to 25 frames per second.

@@ -15,6 +15,7 @@ from warpfem.usd.animation import LARGEST
 from warpfem.usd.colors import ColorScale
 from warpfem.usd.meshes import triangles_of
 from warpfem.usd.prims import OBSTACLES, POINT_PRIMVARS, WORLD
+from warpfem.usd.solids import is_solid, solid_corners
 from warpfem.usd.stages import at_rest, is_trusted, open_stage, read_attributes, reporting, trust, world_matrix
 
 _SCALARS = ("half", "float", "double", "int", "uint", "int64", "uint64")
@@ -76,7 +77,7 @@ class PicturedStage:
         equilibria: whether frames are equilibria on the way to the full load, and not moments in time.
         triangles: of each surface.
         has_insides: of each surface whether its back should not be seen.
-        standing: what does not move.
+        standing: the meshes, planes, cubes and spheres whose points do not move, as they are at the start.
         primvars: names of the scalar primvars that every surface has.
         color: the primvar that the file's own colours show, and their scale, if warpfem wrote it.
     """
@@ -93,7 +94,8 @@ class PicturedStage:
             self.up_axis: str = UsdGeom.GetStageUpAxis(stage)
             world = stage.GetPrimAtPath(WORLD)
             stated = world.GetCustomData().get("warpfem") if world else None
-            meshes = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if _is_seen(prim)]
+            seen = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if _is_seen(prim)]
+            meshes = [prim for prim in seen if prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.TetMesh)]
             self._prims = _without_doubles([prim for prim in meshes if _samples(prim) or (stated and _is_body(prim))])
             if not self._prims:
                 raise OutputError(f"{path} has no mesh whose points move, so that there is nothing to draw")
@@ -112,8 +114,8 @@ class PicturedStage:
             moving = {prim.GetPath() for prim in self._prims}
             self.standing = tuple(
                 self._standing(prim)
-                for prim in meshes
-                if prim.GetPath() not in moving and prim.IsA(UsdGeom.Mesh) and not _samples(prim)
+                for prim in seen
+                if prim.GetPath() not in moving and (is_solid(prim) or (prim.IsA(UsdGeom.Mesh) and self._count(prim)))
             )
 
     def frame(self, index: int) -> list[SurfaceFrame]:
@@ -210,13 +212,17 @@ class PicturedStage:
         return len(at_rest(UsdGeom.PointBased(prim).GetPointsAttr()) or [])
 
     def _standing(self, prim: Usd.Prim) -> Standing:
-        try:
-            points, faces = triangles_of(UsdGeom.Mesh(prim))
-        except MeshError as error:
-            raise OutputError(str(error)) from error
-        self._require(bool(np.abs(points).max() < LARGEST), f"finite points in {prim.GetPath()}")
-        own = prim.GetPath().GetParentPath() == WORLD.AppendChild(OBSTACLES)
-        return Standing(points[faces], own and prim.GetName().startswith("Plane_"))
+        own_plane = prim.GetName().startswith("Plane_") and not _is_body(prim)
+        if is_solid(prim):
+            standing = Standing(solid_corners(prim), prim.IsA(UsdGeom.Plane))
+        else:
+            try:
+                points, faces = triangles_of(UsdGeom.Mesh(prim))
+            except MeshError as error:
+                raise OutputError(str(error)) from error
+            standing = Standing(points[faces], own_plane)
+        self._require(bool((np.abs(standing.corners) < LARGEST).all()), f"finite points in {prim.GetPath()}")
+        return standing
 
     def _frame(self, prim: Usd.Prim, time: float | Usd.TimeCode) -> SurfaceFrame:
         based = UsdGeom.PointBased(prim)
@@ -272,8 +278,8 @@ def read_through(path: str) -> list[str]:
 
 
 def _is_seen(prim: Usd.Prim) -> bool:
-    """Whether a prim is a mesh that is meant to be seen."""
-    if not (prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.TetMesh)):
+    """Whether a prim is a shape that is meant to be seen."""
+    if not prim.IsA(UsdGeom.Gprim):
         return False
     imageable = UsdGeom.Imageable(prim)
     hidden = imageable.ComputeVisibility(Usd.TimeCode.EarliestTime()) == UsdGeom.Tokens.invisible
