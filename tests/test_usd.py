@@ -331,7 +331,7 @@ def test_scalars_of_a_surface_are_read_at_the_corners_of_its_faces(tmp_path: Pat
         (read,) = stage.values("indexed", index)
         assert np.array_equal(read[:, 0], 3.0 + np.arange(len(faces)) % 2)
     with pytest.raises(
-        OutputError, match="lacks primvars:short of /World/block/block_surface at 0, one number for each"
+        OutputError, match="lacks primvars:short of /World/block/block_surface at 0.0, one number for each"
     ):
         stage.values("short", 0)
 
