@@ -12,6 +12,7 @@ from warpfem.commands.session import OK, start_warp
 
 EXTRAS = {
     "meshio": "mesh",
+    "trimesh": "mesh",
     "pytetwild": "tet",
     "matplotlib": "plot",
     "pillow": "plot",
@@ -20,6 +21,7 @@ EXTRAS = {
     "scipy": "bench",
     "scikit-fem": "bench",
     "distributed": "cluster",
+    "newton": "newton",
 }
 """Optional packages and the extra that brings them."""
 

@@ -46,12 +46,15 @@ def kept(out: Path) -> str:
 
 
 def _frames_in(path: Path) -> str:
-    from warpfem.usd import read_animation
+    from warpfem.usd import frames_over, read_animation
 
     try:
         count = read_animation(path).frame_count
     except OutputError:
-        return "no readable frames are"
+        try:
+            count = frames_over(path)
+        except OutputError:
+            return "no readable frames are"
     return "1 frame is" if count == 1 else f"{count} frames are"
 
 

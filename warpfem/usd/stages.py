@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
@@ -82,18 +82,27 @@ def read_attributes(prim: Usd.Prim, time: float) -> None:
         attribute.Get(time)
 
 
+def stated_up_axis(stage: Usd.Stage) -> Literal["Y", "Z"] | None:
+    """The axis that points up, if the file states it."""
+    if not stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis):
+        return None
+    return "Z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "Y"
+
+
+def metres_per_unit(stage: Usd.Stage) -> float:
+    """The stage's unit of length [m]; where the file states none, numbers are metres."""
+    stated = stage.HasAuthoredMetadata(UsdGeom.Tokens.metersPerUnit)
+    return UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
+
+
 def world_matrix(prim: Usd.Prim, time: float | Usd.TimeCode | None = None) -> np.ndarray:
     """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres.
-
-    The stage's unit counts where the file states one; where it does not, numbers are metres.
 
     Args:
         prim: the prim.
         time: when; ``None`` for the earliest time.
     """
-    stage = prim.GetStage()
-    stated = stage.HasAuthoredMetadata(UsdGeom.Tokens.metersPerUnit)
     cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime() if time is None else time)
     matrix = np.array(cache.GetLocalToWorldTransform(prim))
-    matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
+    matrix[:, :3] *= metres_per_unit(prim.GetStage())
     return matrix
