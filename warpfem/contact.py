@@ -411,8 +411,8 @@ class ContactSurface:
 
     ``stopping`` times v^2 + 2 g h is the stiffness [Pa/m] that stops a body within ``STOPPING_DEPTH``, which starts
     towards an obstacle at the speed v and falls on it from the height h: per area, k d^2 / 2 = rho L (v^2 / 2 + g h)
-    for a body of thickness L that hits with all its mass; h counts the depth d. ``impedance`` is rho c, with the speed c
-    of P-waves [kg/(m^2 s)].
+    for a body of thickness L that hits with all its mass; h counts the depth d. ``impedance`` is rho c for P-waves of
+    speed c [kg/(m^2 s)].
     """
 
     def __init__(
