@@ -31,7 +31,7 @@ from warpfem.materials import (
     StVenantKirchhoff,
 )
 from warpfem.mesh import Mesh
-from warpfem.meshing import read_mesh, read_surface, tetrahedralize
+from warpfem.meshing import load_mesh, read_surface, tetrahedralize
 from warpfem.model import Energies, Model, State, Stresses
 from warpfem.moduli import ElasticModuli, elastic_moduli
 from warpfem.reactions import PointForces, Reactions, reactions
@@ -96,9 +96,9 @@ __all__ = [
     "VelocityVerlet",
     "WarpfemError",
     "elastic_moduli",
+    "load_mesh",
     "quantities",
     "reactions",
-    "read_mesh",
     "read_stage",
     "read_surface",
     "record",

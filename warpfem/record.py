@@ -15,6 +15,7 @@ from warpfem.dtypes import FloatName
 from warpfem.errors import OutputError, SimulationError
 from warpfem.failure import failure_path, save_failure
 from warpfem.files import remove
+from warpfem.log import RunLog
 from warpfem.model import Model
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
@@ -31,6 +32,7 @@ def record(
     checkpoint_every: int | None = None,
     resume: bool = False,
     recipe: str = "",
+    log: str | Path | None = None,
     over: str | Path | None = None,
 ) -> Generator[Frame, None, None]:
     """Runs a simulation and stores each frame in the USD file ``path`` while the next one is computed.
@@ -51,8 +53,11 @@ def record(
         over: the USD stage that the scene was read from: ``path`` then becomes a layer over it, with nothing but the
             motion. Such runs have no checkpoints.
 
+        log: a ``.csv`` or ``.jsonl`` that gets a line per frame, of energies, extremes, the solver's work and mean
+            displacements: see :class:`warpfem.log.RunLog`. A resumed run goes on in it.
+
     Raises:
-        OutputError: the file cannot be written; there is nothing to resume, or it is of another scene. Said
+        OutputError: the file or the log cannot be written; there is nothing to resume, or it is of another scene. Said
             before the first step where that can be known, and then nothing has been changed.
         SimulationError: the run cannot go on; the frames so far are in the file.
     """
@@ -74,6 +79,7 @@ def record(
         start.require_fit(simulation, parts, checkpoint_file)
         frame = simulation.restore(start.frame, start.time, start.displacement, start.velocity)
         keep = start.frame, body_frames(simulation.model, frame)
+    run_log = None if log is None else RunLog(log, simulation, None if start is None else start.frame)
     comment, expected_frames = f"warpfem {__version__}", scene.frames + 1
     usd_writer: FrameWriter
     if over is not None:
@@ -92,7 +98,7 @@ def record(
             keep=keep,
             expected_frames=expected_frames,
         )
-    with BackgroundWriter(usd_writer) as writer:
+    with BackgroundWriter(usd_writer) as writer, run_log or contextlib.nullcontext():
         _remove(failure_file)
         if start is None:
             _remove(checkpoint_file)
@@ -101,11 +107,15 @@ def record(
 
         def save_checkpoint(index: int) -> None:
             writer.flush()
+            if run_log:
+                run_log.save()
             Checkpoint.of(simulation, index, parts, recipe).write(checkpoint_file)
 
         with _failure_saved(simulation, failure_file):
             for frame in simulation.frames():
                 writer.write_frame(body_frames(simulation.model, frame))
+                if run_log:
+                    run_log.add(frame)
                 if checkpoint_every and frame.index % checkpoint_every == 0:
                     save_checkpoint(frame.index)
                 try:
@@ -126,6 +136,7 @@ def run(
     checkpoint_every: int | None = None,
     resume: bool = False,
     threads: int | None = None,
+    log: str | Path | None = None,
     over: str | Path | None = None,
 ) -> Summary:
     """Runs a scene and stores it in the USD file ``path``, which is overwritten if it exists.
@@ -138,6 +149,7 @@ def run(
         checkpoint_every: frames between two checkpoints; ``None`` writes none.
         resume: go on after the checkpoint of an earlier run, which differs in the number of frames at most.
         threads: threads of the CPU that steps may use; ``None`` takes all cores. Results are the same.
+        log: a ``.csv`` or ``.jsonl`` that gets a line per frame; ``None`` writes none.
         over: the USD stage that the scene was read from, for a layer over it; see :func:`record`.
 
     Returns:
@@ -147,7 +159,7 @@ def run(
         SceneError, OutputError, SimulationError: as :class:`Simulation` and :func:`record`.
     """
     simulation = Simulation(scene, device=device, dtype=dtype, threads=threads)
-    for _ in record(simulation, path, checkpoint_every=checkpoint_every, resume=resume, over=over):
+    for _ in record(simulation, path, checkpoint_every=checkpoint_every, resume=resume, log=log, over=over):
         pass
     return simulation.summary
 

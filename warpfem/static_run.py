@@ -198,6 +198,7 @@ def record_static(run: StaticRun, path: str | Path) -> Generator[Frame, None, No
         obstacles=scene.obstacles,
         physics=physics_of(scene),
         color_by=scene.color_by,
+        equilibria=True,
         comment=f"warpfem {__version__}",
     ) as writer:
         for frame in chain(first, frames):

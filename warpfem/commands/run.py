@@ -18,6 +18,7 @@ from warpfem.commands.options import load, positive, scene_options, time_options
 from warpfem.commands.output import kept, require_consent
 from warpfem.commands.session import FAILED, OK, fail, held_interrupt, start_warp
 from warpfem.errors import OutputError, SimulationError, WarpfemError
+from warpfem.log_file import check_log_path
 from warpfem.record import record
 from warpfem.scene_file import source_digest
 from warpfem.simulation import Frame, Simulation, Summary
@@ -30,6 +31,13 @@ def add(commands: Any) -> None:
     scene_options(run)
     time_options(run)
     run.add_argument("--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.usdc)")
+    run.add_argument(
+        "--log",
+        type=Path,
+        metavar="F",
+        help=".csv or .jsonl that gets a line per frame: energies, extremes, the solver's work, and the mean "
+        "displacements of bodies and point sets (see warpfem plot)",
+    )
     run.add_argument(
         "--over",
         action="store_true",
@@ -70,11 +78,13 @@ def execute(arguments: argparse.Namespace) -> int:
     check_path(out)
     require_other_file(out, arguments.scene)
     _require_stage(arguments)
+    if arguments.log:
+        check_log_path(arguments.log)
     recipe = _recipe(arguments)
     if arguments.resume:
         scene = Checkpoint.read(checkpoint_path(out)).with_meshes(scene, recipe)
     elif not arguments.overwrite:
-        require_consent(out)
+        require_consent(out, arguments.log)
     say = not (arguments.quiet or arguments.json)
     if say:
         print(f"{arguments.scene}: preparing (the first run of a scene compiles its kernels)", file=sys.stderr)
@@ -88,6 +98,7 @@ def execute(arguments: argparse.Namespace) -> int:
             checkpoint_every=arguments.checkpoint_every,
             resume=arguments.resume,
             recipe=recipe,
+            log=arguments.log,
             over=arguments.scene if arguments.over else None,
         )
         with held_interrupt() as check_interrupt, closing(recording) as frames:
@@ -114,7 +125,7 @@ def execute(arguments: argparse.Namespace) -> int:
     elif not arguments.quiet:
         print(_summary_text(summary, simulation))
         if code == OK:
-            print(f"wrote {out}")
+            print(f"wrote {out}" + (f" and {arguments.log}" if arguments.log else ""))
     return code
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from warpfem.errors import OutputError
-from warpfem.files import beside
+from warpfem.files import beside, existing_folder, require_writable
 from warpfem.usd.bodies import BodyFrame
 from warpfem.usd.chunks import ChunkedLayer, Samples
 from warpfem.usd.stages import reporting, trust
@@ -128,7 +127,7 @@ class FrameWriter(ABC):
 
     def _check_room(self, rest: Samples, frame_count: int) -> None:
         """The partial file and the merged one are on the disk together at the end."""
-        folder = _existing_folder(self.path)
+        folder = existing_folder(self.path)
         frame_bytes = sum(np.asarray(value).nbytes for value in rest.values())
         old = [path for path in beside(self.path, "partial").glob("*") if path.is_file()]
         free = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in old)
@@ -154,16 +153,12 @@ def check_path(path: str | Path) -> None:
     odd = _odd_part(path)
     if odd:
         raise OutputError(f"{str(path)!r} cannot be written: USD does not bear {odd} in the name of a file")
-    with reporting(f"{path} cannot be written", OutputError):
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            beside(path, "writing.checkpoint.npz").stat()  # as long as the longest name beside it
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder: give the name of a file")
-        if path.exists() and not os.access(path, os.W_OK):
-            raise OutputError(f"{path} cannot be written: it is write-protected")
-        folder = _existing_folder(path)
-        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-            raise OutputError(f"{path} cannot be written: {folder} is not a folder that can be written to")
+    with (
+        reporting(f"{path} cannot be written", OutputError),
+        contextlib.suppress(FileNotFoundError, NotADirectoryError),
+    ):
+        beside(path, "writing.checkpoint.npz").stat()  # as long as the longest name beside it
+    require_writable(path)
 
 
 def _odd_part(path: Path) -> str:
@@ -176,14 +171,6 @@ def _odd_part(path: Path) -> str:
     odd = [text for text in ("\0", "\\", ":SDF_FORMAT_ARGS:") if text in whole]
     odd += [character for character in path.name if ord(character) < 32 or ord(character) == 127]
     return repr(odd[0]) if odd else ""
-
-
-def _existing_folder(path: Path) -> Path:
-    """The folder of a path, or the one that it will be made in."""
-    folder = path.absolute().parent
-    while not folder.exists():
-        folder = folder.parent
-    return folder
 
 
 def _size(byte_count: float) -> str:

@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
@@ -74,6 +74,13 @@ def at_rest(attribute: Usd.Attribute) -> Any:
     """The default value of an attribute, or its first sample if there is no default."""
     value = attribute.Get()
     return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
+
+
+def stated_up_axis(stage: Usd.Stage) -> Literal["Y", "Z"] | None:
+    """The axis that points up, if the file states it."""
+    if not stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis):
+        return None
+    return "Z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "Y"
 
 
 def metres_per_unit(stage: Usd.Stage) -> float:

@@ -60,6 +60,7 @@ class UsdWriter(FrameWriter):
         color_by: ColorQuantity = "von_mises",
         color_range: tuple[float, float] | None = None,
         frames_per_chunk: int = 8,
+        equilibria: bool = False,
         comment: str = "",
         keep: tuple[int, Sequence[BodyFrame]] | None = None,
         expected_frames: int = 0,
@@ -77,6 +78,7 @@ class UsdWriter(FrameWriter):
             color_range: values of the first and last colour; ``None``: 0..s for von Mises, 1 - s..1 + s for
                 J, with s such that at most 0.5 % of a body's surface points are beyond in any frame.
             frames_per_chunk: the most frames that wait in memory to be saved.
+            equilibria: frames are equilibria on the way to the full load, and not moments in time.
             comment: stored in the file as its comment.
             keep: the last of the frames to keep that an earlier writer of the same ``path`` left, in its
                 partial file or in ``path`` itself: its index, and what it holds, to know it by. Later frames
@@ -90,6 +92,7 @@ class UsdWriter(FrameWriter):
         self.path = Path(path)
         _check_settings(self.path, bodies, fps, up_axis, color_by, color_range, frames_per_chunk)
         self._quantity: ColorQuantity = color_by
+        self._equilibria = equilibria
         self._fixed_range = color_range
         self._spread = 0.0
         with reporting(f"{self.path} cannot be written", OutputError):
@@ -143,7 +146,8 @@ class UsdWriter(FrameWriter):
     def _metadata(self) -> dict[str, Any]:
         scale = self._scale
         primvar, limits = POINT_PRIMVARS[scale.quantity], Gf.Vec2d(scale.lower, scale.upper)
-        return {"warpfem": {"colorBy": scale.quantity, "colorPrimvar": primvar, "colorRange": limits}}
+        stated = {"colorBy": scale.quantity, "colorPrimvar": primvar, "colorRange": limits}
+        return {"warpfem": stated | ({"equilibria": True} if self._equilibria else {})}
 
     def _samples(self, frames: Sequence[BodyFrame], where: str) -> Samples:
         samples: Samples = {}
