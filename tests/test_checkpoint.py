@@ -21,7 +21,9 @@ from pxr import Sdf
 
 import warpfem as wf
 from warpfem.checkpoint import Checkpoint, checkpoint_path
-from warpfem.cli import FAILED, OK, WRONG_USE, _parser, _recipe, main
+from warpfem.cli import main, parser
+from warpfem.commands.run import _recipe
+from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.failure import failure_path
 from warpfem.files import settle
 from warpfem.scene_file import load_scene
@@ -589,7 +591,7 @@ def test_a_mesh_that_comes_out_different_each_time_is_that_of_the_checkpoint(tmp
     assert main(command(scene, tmp_path / "whole.usdc")[3:]) == OK
     count.write_text("0")
     interrupted = wf.Simulation(load_scene(scene))
-    recipe = _recipe(_parser().parse_args(["run", str(scene)]))
+    recipe = _recipe(parser().parse_args(["run", str(scene)]))
     stop(interrupted, out, 2, checkpoint_every=1, recipe=recipe)
     assert main(command(scene, out, "--resume", "--set", "E=1e4")[3:]) == WRONG_USE
     assert "of another run: body 'cube': the mesh" in capsys.readouterr().err

@@ -5,7 +5,7 @@ import pytest
 from stepping import modes, ready, slab, solver_name
 
 import warpfem as wf
-from warpfem.cli import _summary_text
+from warpfem.commands.run import _summary_text
 from warpfem.explain import explain
 from warpfem.solvers.error_control import controlled_step
 from warpfem.solvers.stability import largest_frequency

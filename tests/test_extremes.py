@@ -6,7 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from warpfem.cli import FAILED, OK, WRONG_USE, main
+from warpfem.cli import main
+from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.errors import MaterialError, SimulationError
 from warpfem.extremes import CASES, Case, Trial, report
 from warpfem.extremes.recovery import block, jacobians, misfit, released, with_one_inverted

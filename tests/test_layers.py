@@ -37,6 +37,7 @@ LAYERS = [
     {"record", "explain", "scene_file", "preview"},
     {"static_run"},
     {"extremes", "trade"},
+    {"commands"},
     {"cli"},
     {"__main__"},
 ]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.cli import _parser
+from warpfem.cli import parser
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -38,7 +38,7 @@ def test_commands_are_those_of_the_parser():
     lines = [line for block in blocks for line in block.splitlines() if line.startswith("warpfem ")]
     assert len(lines) == 12
     for line in lines:
-        _parser().parse_args(line.split("#")[0].split()[1:])
+        parser().parse_args(line.split("#")[0].split()[1:])
 
 
 def test_every_scene_and_every_material_is_in_a_table():

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.cli import FAILED, OK, WRONG_USE, main
+from warpfem.cli import main
+from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.usd import read_animation
 
 SCENES = Path(__file__).parent.parent / "scenes"

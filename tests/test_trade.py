@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.cli import FAILED, OK, WRONG_USE, main
+from warpfem.cli import main
+from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.errors import OutputError, SceneError, SimulationError
 from warpfem.trade.axes import kind_of, mesh_control, parse_axes, settings_of
 from warpfem.trade.executors import cluster_executor, local_executor

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.cli import FAILED, OK, WRONG_USE, main
+from warpfem.cli import main
+from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.errors import SceneError, SimulationError
 from warpfem.motion import Motion
 from warpfem.solvers.implicit import ImplicitSolver

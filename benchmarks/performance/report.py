@@ -220,7 +220,8 @@ def _implicit(result: Results, folder: Path) -> list[str]:
         *_prose(
             f"One step of backward Euler from a deformed state, to a true residual of "
             f"{result['tolerance']:.0e}, computed in "
-            "float64 afterwards. warpfem's systems have the exact tangent; those in the manner of Taichi's example "
+            "float64 afterwards; each turn takes two, of which the second counts. "
+            "warpfem's systems have the exact tangent; those in the manner of Taichi's example "
             "([taichi_implicit.py](../benchmarks/performance/contenders/taichi_implicit.py)) leave the "
             "change of the rotation "
             "out, and *factored* solves with a constant matrix that it factored before."

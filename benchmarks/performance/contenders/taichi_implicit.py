@@ -10,7 +10,7 @@ constant: another system than warpfem's, and an easier one.
 
 import numpy as np
 import taichi as ti
-from serving import Contender, serve, timed
+from serving import Contender, serve, settled, timed
 
 
 def setup(problem, options):
@@ -191,7 +191,7 @@ def setup(problem, options):
             "velocity": velocity,
         }
 
-    return Contender(run, outcome)
+    return Contender(settled(run), outcome)
 
 
 serve(setup)
