@@ -1,5 +1,7 @@
 """Settings of the documentation: ``make docs`` builds it into docs/_build."""
 
+import re
+
 import warpfem
 
 project = "warpfem"
@@ -18,3 +20,14 @@ myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # docstrings tell shapes and units, which hints do not
 napoleon_use_ivar = True  # attributes are listed in their class, and not again as members
+
+
+def _keep_norms(app, what, name, obj, options, lines):
+    """Keeps |A|^2 outside of ``literals`` from being taken for a substitution of reStructuredText."""
+    for index, line in enumerate(lines):
+        parts = re.split("(``.*?``)", line)
+        lines[index] = "".join(part if part.startswith("``") else part.replace("|", "\\|") for part in parts)
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", _keep_norms)
