@@ -61,9 +61,9 @@ STUDIES = (
     ),
     Study(
         "twist",
-        "turn at mid-height",
+        "l2",
         ("cells=1,2,4", "element=P1,P2", "solver=backward_euler,sdirk2", "dt=1/24,1/48"),
-        "A column is twisted by half a turn of its top. Errors are of where an edge at half the height ends.",
+        "A column is twisted by half a turn of its top, and comes to rest. Errors are of its whole motion.",
         ("--limit", "60"),
     ),
 )

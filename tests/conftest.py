@@ -1,6 +1,7 @@
 """Settings and fixtures of all tests."""
 
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,3 +23,11 @@ def interrupts():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def bar(request, tmp_path) -> Path:
+    """The scene file that the test's module has as text in ``BAR``."""
+    path = tmp_path / "bar.py"
+    path.write_text(request.module.BAR)
+    return path

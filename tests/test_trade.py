@@ -42,13 +42,6 @@ def scene(cells: int = 2, E: float = 1e5, dt: float = 1 / 40, kind: str = "soft"
 
 
 @pytest.fixture
-def bar(tmp_path) -> Path:
-    path = tmp_path / "bar.py"
-    path.write_text(BAR)
-    return path
-
-
-@pytest.fixture
 def in_process(monkeypatch):
     """Settings run in this process, which is quicker."""
     monkeypatch.setattr("warpfem.trade.study.run_order", measure)
@@ -289,6 +282,25 @@ def one_by_one(executor, own, settings):
     for setting in settings:
         order = Order(own.problem, setting, own.places, 1, 1.0, own.load)
         yield setting, executor.submit(fake, order).result()
+
+
+def test_runs_are_those_of_the_scene_and_of_what_it_imports(bar, tmp_path):
+    (tmp_path / "shapes").mkdir()
+    used = [tmp_path / "sizes.py", tmp_path / "shapes" / "__init__.py", tmp_path / "shapes" / "plate.py"]
+    for file, text in zip(used, ("WIDTH = 2", "from .plate import *", "HEIGHT = 1"), strict=True):
+        file.write_text(text)
+    other = tmp_path / "other.py"
+    other.write_text("")
+    bar.write_text("import math\nimport shapes.plate\nfrom sizes import WIDTH\n" + BAR)
+    before = Problem.of(bar).key(Setting())
+    other.write_text("LENGTH = 3")
+    assert Problem.of(bar).key(Setting()) == before
+    for file in used:
+        text = file.read_text()
+        file.write_text(text + "\n")
+        assert Problem.of(bar).key(Setting()) != before
+        file.write_text(text)
+    assert Problem.of(bar).key(Setting()) == before
 
 
 def test_times_under_load_are_not_mixed_with_others(bar, tmp_path, monkeypatch):

@@ -36,13 +36,6 @@ def scene(cells: int = 4, E: float = 1e5, dt: float = 1 / 40) -> wf.Scene:
 """
 
 
-@pytest.fixture
-def bar(tmp_path) -> Path:
-    path = tmp_path / "bar.py"
-    path.write_text(BAR)
-    return path
-
-
 # ---- the search for one level
 
 

@@ -129,7 +129,8 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     """With a body that is large enough for all threads, and one of another material that is too small for that."""
     for module in (explicit, implicit):
         monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
-    monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
+    for module in ("model", "solvers.explicit"):
+        monkeypatch.setattr(f"warpfem.{module}.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
     monkeypatch.setattr(explicit, "WINDOW", 64)
     mesh = MESHES["box"]
@@ -145,10 +146,11 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         dt = 0.5 * (stepper.stable_dt(state) or 0.02)
         for _ in range(20):
             stepper.step(state, dt)
-        results.append((state.displacement, state.velocity))
-    for displacement, velocity in results[1:]:
+        results.append((state.displacement, state.velocity, stepper.estimate_stable_dt(state)))
+    for displacement, velocity, limit in results[1:]:
         np.testing.assert_array_equal(displacement, results[0][0])
         np.testing.assert_array_equal(velocity, results[0][1])
+        assert limit == results[0][2]
 
 
 def test_steps_of_vectorised_bodies_follow_those_of_plain_ones(monkeypatch):

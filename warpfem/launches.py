@@ -101,10 +101,18 @@ def jobs(
     """
 
     def job(own: list[wp.Launch], around: AbstractContextManager) -> Job:
-        def launch() -> None:
-            with around:
+        replays: list[Callable[[], Any]] = [each.launch for each in own]
+        if len(launches) > 1 and own:  # a graph takes Python's lock once, for which threads wait
+            with wp.ScopedCapture(device=own[0].device) as capture:
                 for each in own:
                     each.launch()
+            graph = capture.graph
+            replays = [lambda: wp.capture_launch(graph)]
+
+        def launch() -> None:
+            with around:
+                for replay in replays:
+                    replay()
 
         return launch
 

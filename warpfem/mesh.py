@@ -553,9 +553,10 @@ def _signed_volumes(spans: np.ndarray) -> np.ndarray:
 def _signed_quality(spans: np.ndarray) -> np.ndarray:
     """Mean ratio with the sign of the volume; 0 where all points coincide."""
     volumes = _signed_volumes(spans)
-    squares = (spans**2).sum(axis=(1, 2))
+    squares = np.einsum("cij,cij->c", spans, spans)
     for i, j in combinations(range(spans.shape[1]), 2):
-        squares += ((spans[:, i] - spans[:, j]) ** 2).sum(axis=1)
+        other = spans[:, i] - spans[:, j]
+        squares += np.einsum("ci,ci->c", other, other)
     if spans.shape[1] == 2:
         ratio = 4.0 * np.sqrt(3.0) * volumes
     else:

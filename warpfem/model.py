@@ -532,15 +532,16 @@ class Model:
         for block in self.blocks:
             block.vectorize(self.rest_points, least, self.team)
 
-    def describe_forces(self) -> str:
-        """How :meth:`add_internal_force` computes them, and on how many threads."""
+    def describe_forces(self, threads: int | None = None) -> str:
+        """How :meth:`add_internal_force` computes them, and on how many threads, if not on the whole team."""
         count = sum(block.count for block in self.blocks if block.vectorized)
         if not count:
             return "one cell at a time, on one thread"
         plain = self.cell_count - count
         others = f", {plain} others one at a time" if plain else ""
-        threads = "1 thread" if self.team.size == 1 else f"{self.team.size} threads"
-        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {threads}"
+        size = threads or self.team.size
+        team = "1 thread" if size == 1 else f"{size} threads"
+        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {team}"
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""
@@ -736,7 +737,9 @@ def _require_resolved(scene: Scene, epsilon: float, dtype: str) -> None:
     for body in scene.bodies:
         mesh = body.mesh
         B = mesh.inverse_shape_matrices
-        steepest = np.maximum(np.linalg.norm(B, axis=2).max(axis=1), np.linalg.norm(B.sum(axis=1), axis=1))
+        last = -B.sum(axis=1)
+        squares = np.maximum(np.einsum("cij,cij->ci", B, B).max(axis=1), np.einsum("ci,ci->c", last, last))
+        steepest = np.sqrt(squares)
         size = float(np.linalg.norm(np.ptp(mesh.bounding_box, axis=0)))
         thin = np.flatnonzero(steepest * (10.0 * epsilon * size) > 1.0)
         if len(thin):

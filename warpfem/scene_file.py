@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ast
 import difflib
+import hashlib
 import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,50 @@ def scene_parameters(path: str | Path) -> Mapping[str, inspect.Parameter]:
     """
     path = Path(path)
     return _parameters(path, _scene_function(path))
+
+
+def source_digest(path: str | Path) -> str:
+    """Names what a scene file says: its contents, and those of the neighbours that it imports, directly or not.
+
+    Raises:
+        SceneError: no such file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"no scene file '{path}'")
+    digest, found, left = hashlib.sha256(), {path}, [path]
+    while left:
+        file = left.pop()
+        contents = file.read_bytes()
+        digest.update(hashlib.sha256(contents).digest())
+        names = _imported(contents) if file.suffix == ".py" else ()
+        folders = {path.parent, file.parent}  # for what is imported relatively
+        neighbours = {other for name in names for folder in folders for other in _neighbours(folder, name)}
+        new = sorted(neighbours - found)
+        found.update(new)
+        left += new
+    return digest.hexdigest()
+
+
+def _imported(contents: bytes) -> Iterator[str]:
+    """The dotted names that Python code imports, those of functions too; none if it is no code."""
+    try:
+        tree = ast.parse(contents)
+    except (SyntaxError, ValueError):
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (".".join(filter(None, (node.module, alias.name))) for alias in node.names)
+
+
+def _neighbours(folder: Path, name: str) -> list[Path]:
+    """The files below a folder that the import of a dotted name may run."""
+    parts = name.split(".")
+    stems = [folder.joinpath(*parts[: k + 1]) for k in range(len(parts))]
+    files = [file for stem in stems for file in (stem.with_suffix(".py"), stem / "__init__.py")]
+    return [file for file in files if file.is_file()]
 
 
 def _scene_function(path: Path) -> Callable[..., Any]:

@@ -19,6 +19,7 @@ from warpfem.commands.output import kept, require_consent
 from warpfem.commands.session import FAILED, OK, fail, held_interrupt, start_warp
 from warpfem.errors import SimulationError, WarpfemError
 from warpfem.record import record
+from warpfem.scene_file import source_digest
 from warpfem.simulation import Frame, Simulation, Summary
 
 
@@ -109,10 +110,9 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _recipe(arguments: argparse.Namespace) -> str:
-    """What makes the scene: its file, that of the settings and the parameters."""
-    files = [arguments.scene, *([] if arguments.settings is None else [arguments.settings])]
-    contents = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-    return " ".join([*contents, *arguments.parameters])
+    """What makes the scene: its file and what it imports, the settings and the parameters."""
+    settings = [] if arguments.settings is None else [hashlib.sha256(arguments.settings.read_bytes()).hexdigest()]
+    return " ".join([source_digest(arguments.scene), *settings, *arguments.parameters])
 
 
 def _progress(frames: Iterable[Frame], total: int) -> Iterator[Frame]:

@@ -29,6 +29,9 @@ VECTORIZED_CELLS = 1024
 """Cells of a material from which on its forces are computed several cells at a time: that takes some seconds to compile
 once, and work to prepare."""
 
+CELLS_PER_THREAD = 16384
+"""Cells for which a thread is worth while in explicit steps: handing over their two passes takes as long as fewer."""
+
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
 
@@ -79,13 +82,17 @@ class _Passes:
 
     The first computes the forces of the strips, the second sums them for each point and moves it. Which thread does
     what changes no bit of the result.
+
+    Attributes:
+        threads: among which steps are divided.
     """
 
     def __init__(self, model: Model, force: wp.array) -> None:
         self._forces = [block.vectorized for block in model.blocks]
         self._force = force
         self._team = model.team
-        self._points = share(model.point_count, self._team.size, WINDOW)
+        self.threads = max(1, min(self._team.size, model.cell_count // CELLS_PER_THREAD))
+        self._points = share(model.point_count, self.threads, WINDOW)
         self._recordings = Recordings()
 
     def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
@@ -105,7 +112,7 @@ class _Passes:
         first: list[list[wp.Launch | None]] = [[] for _ in self._points]
         second: list[list[wp.Launch | None]] = [[] for _ in self._points]
         for force in self._forces:
-            for launches, part in zip(first, share(force.chunk_count, self._team.size), strict=True):
+            for launches, part in zip(first, share(force.chunk_count, self.threads), strict=True):
                 launches.extend(force.record_forces(state.u, part))
             for launches, points in zip(second, self._points, strict=True):
                 launches.append(force.record_sums(self._force, points))
@@ -136,6 +143,10 @@ class _ExplicitStepper(Stepper):
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
         self._inverse_mass = self._free_inverse_mass()
         self._recordings = Recordings()
+
+    @property
+    def forces(self) -> str:
+        return self.model.describe_forces(None if self._passes is None else self._passes.threads)
 
     def step(self, state: State, dt: float) -> StepReport:
         with self._flushed:

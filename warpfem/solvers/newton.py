@@ -288,26 +288,39 @@ class Newton:
             SimulationError: what comes of it is not finite.
         """
         settings, model, potential = self.settings, self.model, self.potential
-        start = self.start_at_base()
+        self.d.zero_()
+        potential.move(self.d, self.u)
         potential.unbalanced_force(self.d, self.u)
         require_finite(model, potential.force, "the force", time)
         potential.linearize(self.u, settings.hessian)
         result = self._solve(linear_tolerance)
+        slope = -model.dot(potential.force, self._direction)
         potential.add_scaled(self.d, 1.0, self._direction, self.d)
         potential.move(self.d, self.u)
         require_finite(model, self.u, "the displacement", time)
         relative = _largest_ratio(*potential.unbalanced_force(self.d, self.u))
-        rounding = potential.rounding(self.d, self.u)[1]
-        rise = potential.value(self.d, self.u) - start
         if result.status in (LinearStatus.ITERATIONS, LinearStatus.CURVATURE):
             note = f"conjugate gradients {result.status.value}"
         elif result.residual > max(10.0 * linear_tolerance, ROUNDING_LIMIT):
             note = f"rounding of {model.dtype} leaves {result.residual:.1e} of the linear system's right-hand side"
-        elif not rise <= 1e-3 * abs(start) + rounding:
-            note = f"the linear system led {rise:.2g} J above the potential of standing still"
-        else:
+        elif -model.dot(potential.force, self._direction) <= -0.5 * slope:  # as a line search has it; else look closer
             note = ""
+        else:
+            note = self._rise()
         return StepReport(1, result.iterations, relative, not note, note=note)
+
+    def _rise(self) -> str:
+        """Says how far the potential reached is above that of standing still; empty if it is not."""
+        potential = self.potential
+        rounding = potential.rounding(self.d, self.u)[1]
+        reached = potential.value(self.d, self.u)
+        self._trial_d.zero_()
+        potential.move(self._trial_d, self._trial)
+        start = potential.value(self._trial_d, self._trial)
+        rise = reached - start
+        if rise <= 1e-3 * abs(start) + rounding:
+            return ""
+        return f"the linear system led {rise:.2g} J above the potential of standing still"
 
 
 def _largest_ratio(residuals: np.ndarray, scales: np.ndarray) -> float:

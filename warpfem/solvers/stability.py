@@ -5,9 +5,11 @@ import warp as wp
 
 from warpfem.dtypes import uniform_array
 from warpfem.errors import SimulationError
+from warpfem.launches import Recordings, jobs
 from warpfem.linear import tangent_operator
 from warpfem.model import CellBlock, Model, State
 from warpfem.solvers.base import require_finite, worst_cell
+from warpfem.threads import Job, share
 
 POWER_ITERATIONS = 60
 """Products with the stiffness that decide whether a step is unstable for certain."""
@@ -31,17 +33,20 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
     largest = 0.0
     density = _cell_densities(model)
     for block in model.blocks:
-        bounds = _linear_bounds(block, u) if block.shape.order == 1 else _quadratic_bounds(model, block, u)
+        bounds = _linear_bounds(model, block, u) if block.shape.order == 1 else _quadratic_bounds(model, block, u)
         largest = np.maximum(largest, (bounds / density[block.index]).max())  # not a number stays
     if model.contact is not None:
         largest += model.contact.largest_stiffness_over_mass(model.host_mass)
     return float(np.sqrt(largest))
 
 
-def _linear_bounds(block: CellBlock, u: wp.array) -> np.ndarray:
+def _linear_bounds(model: Model, block: CellBlock, u: wp.array) -> np.ndarray:
     """(tr A^8)^(1/8) of each cell at unit density, (count,) float64."""
     out = wp.zeros(block.count, dtype=wp.float64, device=block.device)
-    block.launch("frequency_bound", [u], [out], kernels=block.bounding_kernels)
+    parts = [slice(cells.start, cells.stop) for cells in share(block.count, model.team.size)]
+    kernels = block.bounding_kernels
+    launches = [[block.launch("frequency_bound", [u], [out[p]], part=p, kernels=kernels, record=True)] for p in parts]
+    model.team.run(jobs(launches))
     return block.shape.point_count * out.numpy()
 
 
@@ -83,7 +88,9 @@ class Watch:
         self.model = model
         density = _cell_densities(model)
         self._densities = [self._device_array(density[block.index]) for block in model.blocks]
-        self._square = wp.zeros(1, dtype=model.types.scalar, device=model.device)
+        # one for each thread: shared, they would lose each other's maxima
+        self._squares = wp.zeros(model.team.size, dtype=model.types.scalar, device=model.device)
+        self._recordings = Recordings()
         self._contact = 0.0 if model.contact is None else model.contact.largest_stiffness_over_mass(model.host_mass)
         self._start = model.energies(state)
         size = max(float(np.linalg.norm(np.ptp(body.mesh.bounding_box, axis=0))) for body in model.scene.bodies)
@@ -98,15 +105,35 @@ class Watch:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [*self._densities, self._square]
+        return [*self._densities, self._squares]
 
     def stable_dt(self, u: wp.array) -> float:
         """The estimate of the largest stable time step [s] at the displacements ``u``."""
-        self._square.zero_()
-        for block, density in zip(self.model.blocks, self._densities, strict=True):
-            block.launch("frequency", [density, u], [self._square], kernels=block.bounding_kernels)
-        square = float(self._square.numpy()[0]) + self._contact
+        for block in self.model.blocks:
+            if block.averaged:
+                block.update_pressure(u)
+        self._squares.zero_()
+        self.model.team.run(self._recordings.get((u.ptr,), lambda: self._record(u)))
+        square = float(self._squares.numpy().max()) + self._contact
         return 2.0 / float(np.sqrt(square)) if square > 0.0 else np.inf
+
+    def _record(self, u: wp.array) -> list[Job]:
+        """The launches of the cells' frequencies, divided among threads."""
+        launches: list[list[wp.Launch | None]] = [[] for _ in range(len(self._squares))]
+        for block, density in zip(self.model.blocks, self._densities, strict=True):
+            for thread, cells in enumerate(share(block.count, len(launches))):
+                part = slice(cells.start, cells.stop)
+                launches[thread].append(
+                    block.launch(
+                        "frequency",
+                        [density[part], u],
+                        [self._squares[thread : thread + 1]],
+                        part=part,
+                        kernels=block.bounding_kernels,
+                        record=True,
+                    )
+                )
+        return jobs(launches)
 
     def certain_limit(self, state: State) -> float:
         """A time step [s] above which steps are unstable for certain: by power iteration on M^-1 K of the whole."""

@@ -20,7 +20,7 @@ from warpfem.dtypes import FloatName
 from warpfem.errors import SceneError
 from warpfem.materials import MATERIALS, HookeanMaterial
 from warpfem.scene import ELEMENTS, Body, Scene
-from warpfem.scene_file import load_scene, scene_parameters, value_of
+from warpfem.scene_file import load_scene, scene_parameters, source_digest, value_of
 from warpfem.solvers import SOLVERS, BackwardEuler, Solver
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.solvers.newton import NewtonSettings
@@ -107,7 +107,7 @@ class Problem:
         parameters: values of its parameters that hold unless an axis says otherwise, as on the command line.
         frames: frames to simulate; ``None`` as the scene says.
         device: Warp device; ``None`` takes Warp's default.
-        digest: that of the file's contents; a worker elsewhere may have another file of that name.
+        digest: that of the file and what it imports; a worker elsewhere may have another file of that name.
     """
 
     path: str
@@ -130,7 +130,7 @@ class Problem:
         Raises:
             SceneError: there is no such file.
         """
-        return cls(str(Path(path).absolute()), tuple((parameters or {}).items()), frames, device, _digest(path))
+        return cls(str(Path(path).absolute()), tuple((parameters or {}).items()), frames, device, source_digest(path))
 
     def key(self, setting: Setting) -> str:
         """Names the results of a setting: the same file, parameters, setting and versions give the same."""
@@ -140,7 +140,7 @@ class Problem:
 
     def require_same_file(self) -> None:
         """Raises SceneError if the file is not there, or another one."""
-        if _digest(self.path) != self.digest:
+        if source_digest(self.path) != self.digest:
             raise SceneError(f"{self.path} is not the file that the study was begun with")
 
     def parameter_names(self) -> list[str]:
@@ -206,13 +206,6 @@ def mesh_size(scene: Scene) -> float:
     """The mean size of the cells, (volume / cells)^(1/dim) [m]."""
     volume = sum(float(body.mesh.cell_volumes.sum()) for body in scene.bodies)
     return (volume / sum(body.mesh.cell_count for body in scene.bodies)) ** (1.0 / scene.dim)
-
-
-def _digest(path: str | Path) -> str:
-    try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    except OSError:
-        raise SceneError(f"no scene file '{path}'") from None
 
 
 def _literal(name: str, text: str) -> str:
