@@ -130,7 +130,7 @@ INCLUDES = [
 
 @pytest.mark.parametrize("page, include", INCLUDES, ids=lambda value: getattr(value, "stem", None))
 def test_code_beside_formulas_is_found(page, include):
-    """A marker is on one line of its file, and the end comes after the start: Sphinx would take the first of several."""
+    """A marker is on one line of its file, of several of which Sphinx would take the first, and the end comes after."""
     path, settings = include
     source = (page.parent / path).read_text()
     options = dict(re.findall(r"^:([\w-]+): ?(.*)$", settings, re.MULTILINE))
