@@ -1,4 +1,4 @@
-"""The source distribution builds and installs into an empty environment, where a scene runs that is given by its path."""
+"""The source distribution installs into an empty environment, where a scene runs that is given by its path."""
 
 import shutil
 import subprocess
