@@ -20,6 +20,7 @@ myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # docstrings tell shapes and units, which hints do not
 napoleon_use_ivar = True  # attributes are listed in their class, and not again as members
+napoleon_attr_annotations = False
 
 
 def _keep_norms(app, what, name, obj, options, lines):
