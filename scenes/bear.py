@@ -13,21 +13,19 @@ import numpy as np
 
 import warpfem as wf
 
+SIZE = np.array([4.89, 5.542, 9.78])  # of the file, without a unit
+
 
 def mesh(edge_length: float) -> wf.Mesh:
     import warp.examples
 
-    points, triangles = wf.read_surface(Path(warp.examples.get_asset_directory()) / "bear.usd")
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    height = upper[1] - lower[1]
-    points = (points - (lower + upper) / 2) / height + (0, 0.5, 0)
+    height = SIZE[1]
+    path = Path(warp.examples.get_asset_directory()) / "bear.usd"
     try:
-        return wf.tetrahedralize(points, triangles, edge_length=edge_length)
+        return wf.load_mesh(path, scale=1 / height, edge_length=edge_length)
     except wf.MissingExtraError as error:
         print(f"bear: a box takes the bear's place, because {error}", file=sys.stderr)
-        size = (upper - lower) / height
-        cells = tuple(int(n) for n in np.ceil(size / edge_length))
-        return wf.Mesh.box(size, cells, origin=(-size[0] / 2, 0, -size[2] / 2))
+        return wf.Mesh.box(SIZE / height, np.ceil(SIZE / height / edge_length).astype(int))
 
 
 def scene(
@@ -42,7 +40,7 @@ def scene(
 ) -> wf.Scene:
     bear = mesh(edge_length)
     c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
-    tilted = bear.points @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T
+    tilted = (bear.points - bear.bounding_box.mean(axis=0)) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T
     tilted[:, 1] += height - tilted[:, 1].min()
     bear = wf.Mesh(tilted, bear.cells)
     return wf.Scene(

@@ -11,6 +11,14 @@ wp.config.log_level = wp.LOG_WARNING  # one line per kernel module otherwise
 wp.set_device("cpu")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory):
+    """Keeps meshes made by the tests, and of other processes that they start, apart from the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WARPFEM_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     """Random numbers, the same in every test."""

@@ -25,7 +25,7 @@ import numpy as np
 
 from warpfem.boundary import Plane, Sphere
 from warpfem.child import DAMAGED, limit_resources
-from warpfem.errors import WarpfemError
+from warpfem.errors import MeshError, WarpfemError
 from warpfem.mesh import Mesh
 
 PATIENCE = 20.0
@@ -151,6 +151,18 @@ def _meshio_file(name: str, surface: bool = False, **arguments: object) -> Calla
     return write
 
 
+def _trimesh_file(name: str, **arguments: object) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        import trimesh
+
+        mesh = Mesh.box((1.0, 2.0, 1.0), (1, 2, 1))
+        scene = trimesh.Scene(trimesh.Trimesh(mesh.points, mesh.boundary_faces, process=False))
+        (scene if name.startswith("a.gl") else scene.to_mesh()).export(folder / name, **arguments)
+        return folder / name
+
+    return write
+
+
 def _text_file(name: str, text: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         (folder / name).write_text(text)
@@ -234,12 +246,15 @@ MESH_KINDS = {
     "medit": Kind("solid", _meshio_file("a.mesh")),
     "medit-binary": Kind("solid", _meshio_file("a.meshb")),
     "abaqus": Kind("solid", _text_file("a.inp", SETS)),
-    "obj": Kind("surface", _meshio_file("a.obj", surface=True)),
-    "ply": Kind("surface", _meshio_file("a.ply", surface=True)),
-    "ply-text": Kind("surface", _meshio_file("a.ply", surface=True, binary=False)),
-    "stl": Kind("surface", _meshio_file("a.stl", surface=True, binary=True)),
-    "stl-text": Kind("surface", _meshio_file("a.stl", surface=True)),
-    "off": Kind("surface", _meshio_file("a.off", surface=True)),
+    "vtu-surface": Kind("surface", _meshio_file("a.vtu", surface=True)),
+    "obj": Kind("surface", _trimesh_file("a.obj")),
+    "ply": Kind("surface", _trimesh_file("a.ply")),
+    "ply-text": Kind("surface", _trimesh_file("a.ply", encoding="ascii")),
+    "stl": Kind("surface", _trimesh_file("a.stl")),
+    "stl-text": Kind("surface", _trimesh_file("a.stl", file_type="stl_ascii")),
+    "off": Kind("surface", _trimesh_file("a.off")),
+    "glb": Kind("surface", _trimesh_file("a.glb")),
+    "gltf": Kind("surface", _trimesh_file("a.gltf", embed_buffers=True)),
 }
 USD_KINDS = {
     "usda": Kind("solid", _tets("a.usda")),
@@ -280,9 +295,14 @@ def mutants(kind: Kind, folder: Path, count: int, seed: int) -> list[Path]:
 
 def solid(path: Path) -> None:
     """Reads a mesh, which is valid then."""
-    from warpfem import read_mesh
+    from warpfem.meshing import files
 
-    read_mesh(path)
+    files.tetrahedralize = _leave_empty  # damage can make a surface of a solid
+    files.load_mesh(path)
+
+
+def _leave_empty(*surface: object) -> None:
+    raise MeshError("not here")
 
 
 def surface(path: Path) -> None:
@@ -331,10 +351,10 @@ def read_batch(reader: str, children: bool) -> None:
     os.dup2(2, 1)
     warnings.simplefilter("ignore")
     if not children:
-        from warpfem import meshing
+        from warpfem.meshing import files
         from warpfem.usd import animation, meshes
 
-        for module in (meshing, animation, meshes):
+        for module in (files, animation, meshes):
             module.read_in_child = _read_here
         limit_resources(1e6)
     for line in sys.stdin:

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from stepping import EXPLICIT, LINEARISED, MATERIALS, advance, mean, ready, solver_name
 
-from warpfem.boundary import BoxWalls, Plane, Sphere
+from warpfem.boundary import Box, BoxWalls, Plane, Sphere
 from warpfem.errors import SceneError
 from warpfem.materials import LinearElasticity, StableNeoHookean
 from warpfem.mesh import Mesh
@@ -44,9 +44,11 @@ def contact_force(model, state):
 # ---- derivatives
 
 TILTED = {2: (0.6, 0.8), 3: (0.48, 0.8, 0.36)}
+TURNED = {2: ((0.8, -0.6), (1.2, 1.6)), 3: ((0.8, -0.6, 0.0), (0.48, 0.64, 0.6), (-0.36, -0.48, 0.8))}
 OBSTACLES = {
     "plane": lambda dim, **more: Plane((0.3, 0.2, 0.1)[:dim], TILTED[dim], **more),
     "sphere": lambda dim, **more: Sphere((0.4, -0.7, 0.5)[:dim], 1.0, **more),
+    "box": lambda dim, **more: Box((0.4, -0.15, 0.5)[:dim], (0.9, 0.5, 0.8)[:dim], TURNED[dim], **more),
     "walls": lambda dim, **more: BoxWalls((0.05,) * dim, (0.6,) * dim, **more),
 }
 
@@ -229,11 +231,13 @@ def test_default_stiffness_stops_a_thrown_body_within_a_quarter_of_its_thickness
 
 @pytest.mark.parametrize("solver", FAMILIES, ids=solver_name)
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("kind", ["sphere", "walls"])
+@pytest.mark.parametrize("kind", ["sphere", "box", "walls"])
 def test_obstacles_carry_a_body(kind, dim, solver):
-    # on the top of a sphere, and in a box with a tilted gravity
+    # on the top of a sphere or of a larger box, and in a box with a tilted gravity
     if kind == "sphere":
         obstacle, gravity = Sphere((0.5, -2.0, 0.5)[:dim], 2.0), (0.0, -G, 0.0)[:dim]
+    elif kind == "box":
+        obstacle, gravity = Box((0.5, -0.1, 0.5)[:dim], (3.0, 0.2, 3.0)[:dim]), (0.0, -G, 0.0)[:dim]
     else:
         obstacle, gravity = BoxWalls((-0.01,) * dim, (1.01,) * dim), (-3.0, -G, 2.0)[:dim]
     model, state, stepper = ready(Scene([brick(dim)], solver, gravity=gravity, obstacles=[obstacle], damping=20.0))
@@ -439,17 +443,42 @@ def test_a_bounce_restores_the_height(dim):
         (lambda: Plane((0.0, 0.0), (0.0, 1.0), stiffness=0.0), "stiffness must be a finite number above 0"),
         (lambda: Sphere((0.0, 0.0), 0.0), "Sphere: radius must be a finite number above 0"),
         (lambda: Sphere((0.0, 0.0), 1.0, friction=np.inf), "Sphere: friction"),
+        (lambda: Box((0.0, 0.0), (1.0, 0.0)), "Box: size .* must be 2 numbers above 0"),
+        (lambda: Box((0.0, 0.0), (1.0, 1.0, 1.0)), "Box: size"),
+        (lambda: Box((0.0, 0.0), (1.0, 1.0), ((1.0, 0.0), (1.0, 1.0))), "Box: axes must be 2 directions"),
+        (lambda: Box((0.0, 0.0), (1.0, 1.0), ((1.0, 0.0), (0.0, 0.0))), "Box: axes"),
+        (lambda: Box((0.0, 0.0), (1.0, 1.0), ((1.0, 0.0), (0.0, 1.0, 0.0))), "Box: axes"),
+        (lambda: Box((0.0, 0.0), (1.0, 1.0), 5.0), "Box: axes"),
         (lambda: BoxWalls((0.0, 0.0), (1.0, 0.0)), "must be below upper"),
         (
             lambda: Scene([brick(2)], SymplecticEuler(), obstacles=[plane(3)]),
             "Plane: its place must be a finite vector of length 2",
         ),
-        (lambda: Scene([brick(2)], SymplecticEuler(), obstacles=["floor"]), "must be a Plane, Sphere or BoxWalls"),
+        (lambda: Scene([brick(2)], SymplecticEuler(), obstacles=["floor"]), "must be a Plane, Sphere, Box or BoxWalls"),
     ],
 )
 def test_refuses_obstacles(make, message):
     with pytest.raises(SceneError, match=message):
         make()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_box_stops_the_way_into_its_core(dim, rng):
+    box = OBSTACLES["box"](dim)
+    model, _, _ = ready(Scene([brick(dim)], BackwardEuler(), obstacles=[box]))
+    contact, surface = model.contact, model.contact.surface
+    u = rng.normal(scale=0.6, size=(model.point_count, dim))
+    way = box.center - model.rest_points - u + rng.normal(scale=0.1, size=u.shape)  # more or less to its centre
+    limit = wp.full(1, 2.0, dtype=model.types.scalar, device=model.device)
+    vectors = [wp.array(own, dtype=model.types.vector, device=model.device) for own in (u, way)]
+    contact.limit_step(*vectors, limit)
+
+    steps = np.linspace(0.0, 2.0, 20001)[:, None, None]
+    x = (surface.rest + u[surface.host_points]) + steps * way[surface.host_points]
+    inside = (np.abs((x - box.center) @ box.shape.T) < 0.5).all(axis=2)
+    enters = inside[:, ~inside[0]].any(axis=1)
+    assert inside[0].any() and enters.any()
+    assert limit.numpy()[0] == pytest.approx(steps[np.argmax(enters), 0, 0], abs=2e-4)
 
 
 def test_a_normal_may_have_any_length():
@@ -518,16 +547,18 @@ def test_the_default_obstacle_stops_a_soft_body_that_falls(E):
     assert 0.0 < deepest < 0.25
 
 
+@pytest.mark.parametrize("kind", ["sphere", "box"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_long_step_does_not_leap_over_a_sphere(dim):
+def test_a_long_step_does_not_leap_over_an_obstacle(dim, kind):
     mesh = (
         Mesh.rectangle((0.4, 0.4), (2, 2), (-0.2, 0.1))
         if dim == 2
         else Mesh.box((0.4,) * 3, (2, 2, 2), (-0.2, 0.1, -0.2))
     )
     body = Body("cube", mesh, StableNeoHookean(E=1e9, nu=0.3), velocity=(0.0, -100.0, 0.0)[:dim])
-    sphere = Sphere((0.0, -1.0, 0.0)[:dim], 1.0)
-    model, state, stepper = ready(Scene([body], BackwardEuler(), obstacles=[sphere]))
+    below = (0.0, -1.0, 0.0)[:dim]
+    obstacle = Sphere(below, 1.0) if kind == "sphere" else Box(below, (4.0, 2.0, 3.0)[:dim])
+    model, state, stepper = ready(Scene([body], BackwardEuler(), obstacles=[obstacle]))
     stepper.step(state, 1.0 / 24.0)  # by itself the body would fly 4 m, to the far side
     x = model.rest_points + state.displacement
     assert x[:, 1].min() > -0.1

@@ -35,6 +35,7 @@ def check(folder: Path, names: list[str], reader: str, count: int, seed: int) ->
         pytest.importorskip("PIL")
     if set(names) & set(MESH_KINDS):
         pytest.importorskip("meshio")
+        pytest.importorskip("trimesh")
     paths, whole = [], []
     for name in names:
         made = mutants(KINDS[name], folder / name, count, seed)

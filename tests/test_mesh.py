@@ -288,7 +288,7 @@ TWO = [[0, 1, 2, 3], [1, 2, 3, 4]]
         (TRIANGLE, [0, 1, 2], r"cells must be \(m, 3\) or \(m, 6\) triangles for points in 2D, not of shape \(3,\)"),
         (TRIANGLE, [[0, 1, 2, 0]], r"cells must be \(m, 3\) or \(m, 6\) triangles for points in 2D"),
         (TETRAHEDRON, [[0, 1]], r"cells must be \(m, 4\) or \(m, 10\) tetrahedra for points in 3D"),
-        (TETRAHEDRON, [[0, 1, 2]], "surface, not a solid: .*warpfem.meshing.tetrahedralize"),
+        (TETRAHEDRON, [[0, 1, 2]], "surface, not a solid: .*warpfem.tetrahedralize"),
         (TRIANGLE, [], "the mesh has no cells"),
         (TRIANGLE, np.empty((0, 3), dtype=int), "the mesh has no cells"),
         (np.where(FIVE == 1.0, np.nan, FIVE), TWO, r"point 1 is not finite \(4 of 5 points in all\)"),

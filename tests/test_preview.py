@@ -8,12 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pxr import Sdf, Usd, UsdGeom
 
 from warpfem.boundary import BoxWalls, Obstacle, Plane, Sphere
+from warpfem.cli import parser
 from warpfem.errors import MissingExtraError, OutputError
 from warpfem.mesh import Mesh
-from warpfem.preview import MOST_FRAMES, preview
-from warpfem.usd import BodyFrame, ColorScale, UsdBody, UsdWriter
+from warpfem.preview import CAMERAS, MOST_FRAMES, preview
+from warpfem.preview.camera import USUAL
+from warpfem.preview.coloring import Coloring
+from warpfem.preview.page import Page
+from warpfem.preview.scene import Scene
+from warpfem.usd import BodyFrame, ColorScale, UsdBody, UsdWriter, read_animation
 
 Image = pytest.importorskip("PIL.Image")
 pytest.importorskip("matplotlib")
@@ -24,14 +30,14 @@ OBSTACLES: dict[int, list[Obstacle]] = {
     3: [Plane((0, -0.1, 0), (0.1, 1, 0)), Sphere((1.5, 0.2, 0), 0.4), BoxWalls((-1, -0.5, -1), (3, 3, 3))],
 }
 PANEL = (249, 250, 251)
-BARS = 116
+BARS = 136
 """Width of what is at the right of the panels."""
 
 
 @pytest.fixture(autouse=True)
 def small_panels(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the usual number of pixels, for speed."""
-    monkeypatch.setattr(sys.modules["warpfem.preview"], "_PANEL_PIXELS", 50_000)
+    monkeypatch.setattr("warpfem.preview.camera.PANEL_PIXELS", 50_000)
 
 
 def write(
@@ -122,8 +128,7 @@ def test_a_sheet_has_as_many_panels_as_there_are_frames(tmp_path: Path, frame_co
     [
         (25.0, 3, [40, 40, 40]),
         (24.0, 6, [40, 40, 40, 50, 40, 40]),  # hundredths of a second, in step with the clock
-        (200.0, 10, [20, 20, 10]),  # every fourth frame, 50 ms in all
-        (60.0, 6, [30, 40, 30]),
+        (200.0, 200, [20] * 50),  # every fourth frame
         (2.0, 1, [500]),
     ],
 )
@@ -133,12 +138,21 @@ def test_a_gif_keeps_the_time(tmp_path: Path, fps: float, frame_count: int, dura
     assert found == durations
     assert sum(durations) == pytest.approx(1000.0 * frame_count / fps, abs=5.0)
     heights = [center(colored(frame))[0] for frame in frames]
-    assert (np.diff(heights) < -3).all()
+    assert (np.diff(heights) < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("fps", "frame_count", "each"),
+    [(200.0, 10, 40), (1e5, 3, 40), (0.1, 2, 500)],  # runs of less than a second, and frames of more than half of one
+)
+def test_a_gif_is_slowed_down_or_sped_up_where_one_would_see_nothing(tmp_path: Path, fps, frame_count, each) -> None:
+    path = write(tmp_path / "run.usdc", 2, frame_count, fps=fps)
+    assert pictures(preview(path, tmp_path / "film.gif"))[1] == [each] * frame_count
 
 
 def test_a_long_gif_is_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "run.usdc", 2, 11)
-    assert MOST_FRAMES == {".png": 6, ".gif": 120}
+    assert MOST_FRAMES == {".png": 6, ".gif": 120, ".mp4": 480}
     monkeypatch.setitem(MOST_FRAMES, ".gif", 5)
     assert pictures(preview(path, tmp_path / "film.gif"))[1] == [120, 120, 120, 80]
     assert pictures(preview(path, tmp_path / "film.gif", frames=2))[1] == [240, 200]
@@ -292,6 +306,137 @@ def test_a_wall_in_front_is_glass(tmp_path: Path) -> None:
     assert colored(through).mean() > 0.3 * colored(open_view).mean()
 
 
+@pytest.mark.parametrize(
+    ("camera", "right", "up"),
+    [  # where x, y and z go in the image
+        ("front", (1, 0, 0), (0, 1, 0)),
+        ("0,0", (1, 0, 0), (0, 1, 0)),
+        ("right", (0, 0, -1), (0, 1, 0)),
+        ("back", (-1, 0, 0), (0, 1, 0)),
+        ("left", (0, 0, 1), (0, 1, 0)),
+        ("-90,0", (0, 0, 1), (0, 1, 0)),
+        ("top", (1, 0, 0), (0, 0, -1)),
+        ("bottom", (1, 0, 0), (0, 0, 1)),
+        ("45,0", (0.5**0.5, 0, -(0.5**0.5)), (0, 1, 0)),
+    ],
+)
+def test_the_camera_is_where_it_is_told_to_be(tmp_path: Path, camera: str, right, up) -> None:
+    path = write(tmp_path / "run.usdc", 3, 4, move=moved_by((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    frames, _ = pictures(preview(path, tmp_path / "film.gif", camera=camera))
+    places = [center(colored(frame)) for frame in frames]
+    meter = np.ptp(np.argwhere(colored(frames[0]))[:, 0]) + 1  # the height of the cube
+    for axis in range(3):
+        down, across = (places[1 + axis] - places[0]) / meter
+        assert [across, -down] == pytest.approx([right[axis], up[axis]], abs=0.03)
+
+
+def test_the_camera_and_the_elevation_count_from_the_side_that_z_up_has_in_front(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.usdc", 3, 2, move=moved_by((0, 0, 0), (0, 0, 1)), up_axis="Z")
+    frames, _ = pictures(preview(path, tmp_path / "film.gif", camera="front"))
+    down, across = center(colored(frames[1])) - center(colored(frames[0]))
+    assert down < -20 and abs(across) < 1
+
+
+@pytest.mark.parametrize("camera", ["side", "", "30", "30,20,10", "30,91", "nan,0", "inf,0", "a,b"])
+def test_unknown_cameras_are_refused(tmp_path: Path, camera: str) -> None:
+    with pytest.raises(OutputError, match="a camera is one of front, right, back, left, top, bottom, or AZIMUTH"):
+        preview(tmp_path / "missing.usdc", tmp_path / "sheet.png", camera=camera)
+
+
+def test_a_2d_animation_takes_no_camera(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.usdc", 2, 1)
+    with pytest.raises(OutputError, match="is 2D, which has no other camera"):
+        preview(path, tmp_path / "sheet.png", camera="top")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_colors_show_any_scalar_of_the_file(tmp_path: Path) -> None:
+    """A number per face that an other program added: one colour per cell, from one end of the table to the other."""
+    path = write(tmp_path / "run.usda", 2, 1)
+    face_count = len(MESHES[2].cells)
+    stage = Usd.Stage.Open(str(path))
+    surface = stage.GetPrimAtPath("/World/block/block_surface")
+    heat = UsdGeom.PrimvarsAPI(surface).CreatePrimvar("heat", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
+    heat.Set([-3 if face % 2 else 7 for face in range(face_count)])
+    stage.Save()
+    (sheet,), _ = pictures(preview(path, tmp_path / "sheet.png", color="heat"))
+    shades, counts = np.unique(sheet[colored(sheet)], axis=0, return_counts=True)
+    table = 255 * ColorScale("von_mises", -3.0, 7.0).srgb(np.array([-3.0, 7.0]))
+    for shade in table:
+        assert np.abs(shades[counts > 0.3 * counts.sum()] - shade).max(axis=1).min() <= 1
+
+
+@pytest.mark.parametrize(
+    ("color", "lower", "upper"),
+    [
+        ("displacement", 0.0, 2.0 * 2.0**0.5),  # of the last frame
+        ("speed", 0.0, 1.0),  # nothing moves: a range of some width
+        ("vonMises", 0.0, 1e4),
+        ("vonMisesPoint", 0.0, 1e4),
+        ("J", 0.0, 2.0),
+        (None, 0.0, 2e4),  # that of the file
+    ],
+)
+def test_the_range_of_the_colors_is_that_of_all_frames(tmp_path: Path, color, lower: float, upper: float) -> None:
+    path = write(tmp_path / "run.usdc", 2, 3, move=lambda points, index: points + index)
+    scale = Coloring.of(read_animation(path), color).scale
+    assert (scale.lower, scale.upper) == pytest.approx((lower, upper))
+
+
+def test_unknown_colors_are_refused_with_those_that_there_are(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.usdc", 2, 1)
+    for name in ("stress", "displayColor"):  # a colour is no number
+        with pytest.raises(OutputError, match=f"nothing named '{name}' .* J, JPoint, vonMises, vonMisesPoint, displ"):
+            preview(path, tmp_path / "sheet.png", color=name)
+
+
+def test_equilibria_are_counted_and_shown_long_enough(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.usdc", 2, 3, equilibria=True)
+    animation = read_animation(path)
+    assert animation.equilibria
+    assert not read_animation(write(tmp_path / "motion.usdc", 2, 3)).equilibria
+    assert pictures(preview(path, tmp_path / "film.gif"))[1] == [500] * 3
+    coloring = Coloring.of(animation, None)
+    page = Page(coloring, Scene(animation, coloring, None).view, 3)
+    page.show([np.zeros((9, 9, 3))] * 3, range(3))
+    assert [axes.get_title() for axes in page.figure.axes[:3]] == ["start", "load step 1 of 2", "load step 2 of 2"]
+
+
+@pytest.mark.parametrize(
+    ("fps", "frame_count", "shown", "rate"),
+    [(24.0, 30, 30, 24.0), (100.0, 100, 50, 50.0), (0.1, 2, 2, 2.0)],
+)
+def test_an_mp4_shows_the_motion(tmp_path: Path, fps: float, frame_count: int, shown: int, rate: float) -> None:
+    encoder = pytest.importorskip("imageio_ffmpeg")
+    path = write(tmp_path / "run.usdc", 2, frame_count, fps=fps)
+    film = encoder.read_frames(str(preview(path, tmp_path / "film.mp4")))
+    facts = next(film)
+    width, height = facts["size"]
+    assert width % 2 == 0 and height % 2 == 0
+    assert facts["fps"] == pytest.approx(rate, rel=1e-3)
+    assert facts["codec"] == "h264"
+    frames = [np.frombuffer(frame, np.uint8).reshape(height, width, 3)[:, :-BARS].astype(int) for frame in film]
+    assert len(frames) == shown
+    heights = [center(colored(frame))[0] for frame in frames]
+    assert (np.diff(heights) < 0).all()
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "film.mp4", path]
+
+
+def test_an_mp4_without_its_encoder_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingExtraError, match=r"a film as \.mp4 needs .*'imageio-ffmpeg'.*warpfem\[video\]"):
+        preview(write(tmp_path / "run.usdc", 2, 1), tmp_path / "film.mp4")
+
+
+def test_help_names_the_cameras(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        parser().parse_args(["preview", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for camera in CAMERAS:
+        assert camera in text
+    assert f"default: {USUAL[0]:g},{USUAL[1]:g}" in text
+
+
 @pytest.mark.parametrize("package", ["matplotlib", "PIL"])
 def test_missing_packages_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
     path = write(tmp_path / "run.usdc", 2, 1)
@@ -305,8 +450,8 @@ def test_missing_packages_name_the_extra(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     ("out", "frames", "message"),
     [
-        ("sheet.jpg", None, r"must end in \.png or \.gif"),
-        ("sheet", None, r"must end in \.png or \.gif"),
+        ("sheet.jpg", None, r"must end in \.png, \.gif, \.mp4"),
+        ("sheet", None, r"must end in \.png, \.gif, \.mp4"),
         ("nowhere/sheet.png", None, "folder does not exist"),
         ("folder.png", None, "is a folder"),
         ("sheet.png", 0, "at least 1 frame, not 0"),

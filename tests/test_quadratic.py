@@ -186,7 +186,7 @@ def test_quadratic_files_keep_their_curved_edges(suffix, dim, tmp_path):
     kind = "tetra10" if dim == 3 else "triangle6"
     formats = {".msh": "gmsh", ".vtu": "vtu", ".inp": "abaqus"}
     meshio.write(path, meshio.Mesh(points, [(kind, mesh.cells)]), file_format=formats[suffix])
-    again = wf.read_mesh(path)
+    again = wf.load_mesh(path)
     assert again.order == 2
     np.testing.assert_array_equal(again.cells, mesh.cells)
     np.testing.assert_allclose(again.points, mesh.points, rtol=1e-12)

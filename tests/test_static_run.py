@@ -45,6 +45,7 @@ def test_prints_and_stores_an_equilibrium(tmp_path, capsys):
         assert text in printed
     assert "obstacle" not in printed
     animation = read_animation(out)
+    assert animation.equilibria
     assert animation.frame_count == 2
     (start,), (end,) = animation.frame(0), animation.frame(1)
     assert (start.points[:, 1] >= 0.0).all()

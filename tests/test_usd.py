@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdValidation, Vt
 
-from warpfem.boundary import BoxWalls, Plane, Sphere
+from warpfem.boundary import Box, BoxWalls, Plane, Sphere
 from warpfem.errors import MeshError, OutputError
 from warpfem.mesh import Mesh
 from warpfem.usd import (
@@ -27,14 +27,24 @@ from warpfem.usd import (
     UsdWriter,
     animation,
     read_animation,
+    read_mesh,
     read_surface_mesh,
-    read_tet_mesh,
 )
 
 REPOSITORY = Path(__file__).parent.parent
 OBSTACLES = {
-    2: (Plane((0.0, -1.0), (0.3, 1.0)), Sphere((2.0, 0.0), 0.5), BoxWalls((-1.0, -1.0), (3.0, 3.0))),
-    3: (Plane((0, -1, 0), (0, 1, 0.2)), Sphere((2, 0, 0), 0.5), BoxWalls((-1, -1, -1), (3, 3, 3))),
+    2: (
+        Plane((0.0, -1.0), (0.3, 1.0)),
+        Sphere((2.0, 0.0), 0.5),
+        Box((2.0, 1.0), (0.5, 0.3), ((1.0, 1.0), (1.0, -1.0))),
+        BoxWalls((-1.0, -1.0), (3.0, 3.0)),
+    ),
+    3: (
+        Plane((0, -1, 0), (0, 1, 0.2)),
+        Sphere((2, 0, 0), 0.5),
+        Box((2, 1, 0), (0.5, 0.3, 0.2), ((1, 1, 0), (1, -1, 0), (0, 0, 1))),
+        BoxWalls((-1, -1, -1), (3, 3, 3)),
+    ),
 }
 SETUPS = [pytest.param(2, id="2D"), pytest.param(3, id="3D")]
 
@@ -288,17 +298,66 @@ def test_read_animation_gives_back_what_was_written(tmp_path: Path, dim: int) ->
             assert np.array_equal(frame.points, lifted(frames[index][number].points).astype(np.float32))
             assert frame.von_mises == pytest.approx(frames[index][number].von_mises, rel=1e-6)
             assert frame.jacobian == pytest.approx(frames[index][number].jacobian, rel=1e-6)
-            assert frame.colors.shape == frame.points.shape
     for index in (-1, 4):
         with pytest.raises(IndexError):
             animation.frame(index)
+
+
+def test_an_output_is_a_mesh_again(tmp_path: Path) -> None:
+    body = make_body(3)
+    write(tmp_path / "run.usdc", [body], 2, obstacles=OBSTACLES[3])
+    mesh = read_mesh(tmp_path / "run.usdc")
+    assert np.array_equal(mesh.cells, body.cells)
+    assert np.array_equal(mesh.points, body.rest_points.astype(np.float32))
+
+
+@pytest.mark.parametrize("dim", SETUPS)
+def test_scalars_of_a_surface_are_read_at_the_corners_of_its_faces(tmp_path: Path, dim: int) -> None:
+    body = make_body(dim)
+    write(tmp_path / "run.usdc", [body], 2)
+    stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
+    surface = UsdGeom.Mesh.Get(stage, "/World/block/block_surface")
+    faces = np.array(surface.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    point_count = len(surface.GetPointsAttr().Get(0))
+    primvars, tokens = UsdGeom.PrimvarsAPI(surface), UsdGeom.Tokens
+    expected = {}
+    for interpolation, count, pick in (
+        (tokens.constant, 1, lambda values: np.full(faces.shape, values[0])),
+        (tokens.uniform, len(faces), lambda values: np.repeat(values[:, None], 3, axis=1)),
+        (tokens.vertex, point_count, lambda values: values[faces]),
+        (tokens.varying, point_count, lambda values: values[faces]),
+        (tokens.faceVarying, faces.size, lambda values: values.reshape(faces.shape)),
+    ):
+        name = f"by_{interpolation}"
+        primvar = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.DoubleArray, interpolation)
+        for index in range(2):
+            primvar.Set(np.arange(count) + 0.5 + index, index)
+        expected[name] = pick(np.arange(count) + 0.5)
+    indexed = primvars.CreatePrimvar("indexed", Sdf.ValueTypeNames.HalfArray, tokens.uniform)
+    indexed.Set([3.0, 4.0])
+    indexed.SetIndices([face % 2 for face in range(len(faces))])
+    short = primvars.CreatePrimvar("short", Sdf.ValueTypeNames.IntArray, tokens.vertex)
+    short.Set([1, 2])
+    stage.Save()
+    animation = read_animation(tmp_path / "run.usdc")
+    assert set(animation.primvars) == {*expected, "indexed", "short", "J", "JPoint", "vonMises", "vonMisesPoint"}
+    for index in range(2):
+        for name, values in expected.items():
+            (read,) = animation.surface_values(name, index)
+            assert np.array_equal(read, values + index), name
+        (read,) = animation.surface_values("indexed", index)
+        assert np.array_equal(read[:, 0], 3.0 + np.arange(len(faces)) % 2)
+    with pytest.raises(
+        OutputError, match="lacks primvars:short of /World/block/block_surface at 0, one number for each"
+    ):
+        animation.surface_values("short", 0)
 
 
 @pytest.mark.parametrize("dim", SETUPS)
 def test_obstacles_are_where_they_act(tmp_path: Path, dim: int) -> None:
     body = make_body(dim)
     write(tmp_path / "run.usdc", [body], 0, obstacles=OBSTACLES[dim])
-    plane, sphere, walls = read_animation(tmp_path / "run.usdc").obstacles
+    plane, sphere, box, walls = read_animation(tmp_path / "run.usdc").obstacles
     declared = OBSTACLES[dim]
     distances = (plane[0][:, :dim] - declared[0].point) @ declared[0].normal
     assert distances.max() == pytest.approx(0.0, abs=1e-6)
@@ -306,17 +365,19 @@ def test_obstacles_are_where_they_act(tmp_path: Path, dim: int) -> None:
     assert np.ptp(plane[0], axis=0).max() > 3.5
     radii = np.linalg.norm(sphere[0][:, :dim] - declared[1].center, axis=1)
     assert radii == pytest.approx(0.5, abs=1e-6)
-    inside = (walls[0][:, :dim] > np.array(declared[2].lower) + 1e-6) & (
-        walls[0][:, :dim] < np.array(declared[2].upper) - 1e-6
+    inside = (walls[0][:, :dim] > np.array(declared[3].lower) + 1e-6) & (
+        walls[0][:, :dim] < np.array(declared[3].upper) - 1e-6
     )
     assert not inside.all(axis=1).any()
     assert walls[0][:, :dim].min() < -1.0 and walls[0][:, :dim].max() > 3.0
+    assert np.abs((box[0][:, :dim] - declared[2].center) @ declared[2].shape.T) == pytest.approx(1.0, abs=1e-5)
     if dim == 2:
-        assert all((points[:, 2] < 0.0).all() for points, _ in (plane, sphere, walls))
+        assert all((points[:, 2] < 0.0).all() for points, _ in (plane, sphere, box, walls))
     else:
-        corners = sphere[0][sphere[1]]
-        areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert (np.einsum("ij,ij->i", areas, corners.mean(axis=1) - declared[1].center) > 0.0).all()
+        for (points, triangles), own in ((sphere, declared[1]), (box, declared[2])):
+            corners = points[triangles]
+            areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            assert (np.einsum("ij,ij->i", areas, corners.mean(axis=1) - own.center) > 0.0).all()
 
 
 def test_colors_have_one_range_for_the_whole_run(tmp_path: Path) -> None:
@@ -405,7 +466,8 @@ def test_no_frames_leave_the_rest_shape(tmp_path: Path) -> None:
     assert_sound(tmp_path / "run.partial.usda", 0)
     assert writer.close() == writer.close() == tmp_path / "run.usdc"
     assert_sound(tmp_path / "run.usdc", 0)
-    points, cells = read_tet_mesh(tmp_path / "run.usdc")
+    read = read_mesh(tmp_path / "run.usdc")
+    points, cells = read.points, read.cells
     assert points == pytest.approx(body.rest_points, abs=1e-7) and np.array_equal(cells, body.cells)
 
 
@@ -664,7 +726,7 @@ def test_a_disk_without_room_is_said_at_once(tmp_path: Path, monkeypatch) -> Non
     left.write_frame([make_frame(body, 0)])
     before = {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()}
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr("warpfem.usd.writer.shutil.disk_usage", lambda folder: usage._replace(free=int(0.7 * needed)))
+    monkeypatch.setattr("warpfem.usd.frames.shutil.disk_usage", lambda folder: usage._replace(free=int(0.7 * needed)))
     with pytest.raises(OutputError, match=r"its 40 frames need \d[\d.]* MB .* has \d[\d.]* MB free: take another"):
         UsdWriter(path, [body], fps=24, expected_frames=40)
     assert {str(item): item.read_bytes() for item in tmp_path.rglob("*") if item.is_file()} == before
@@ -872,7 +934,8 @@ def author_tets(path: Path, cells, *, meters_per_unit=None, orientation="rightHa
 @pytest.mark.parametrize(("authored", "unit"), [(None, 1.0), (1.0, 1.0), (0.01, 0.01)])
 def test_tet_meshes_come_in_metres_and_in_the_world(tmp_path: Path, authored, unit: float) -> None:
     author_tets(tmp_path / "a.usda", [(0, 1, 2, 3)], meters_per_unit=authored, scale=(2, 3, 4)).Save()
-    points, cells = read_tet_mesh(tmp_path / "a.usda")
+    read = read_mesh(tmp_path / "a.usda")
+    points, cells = read.points, read.cells
     assert (points.dtype, cells.dtype) == (np.float64, np.int32)
     assert points == pytest.approx(unit * (TETRAHEDRON * (2, 3, 4) + (10, 0, 0)), rel=1e-12)
     assert cells.tolist() == [[0, 1, 2, 3]]
@@ -882,8 +945,8 @@ def test_tet_meshes_come_in_metres_and_in_the_world(tmp_path: Path, authored, un
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_tet_meshes_come_with_positive_volumes(tmp_path: Path, orientation: str, cell, mirror: int) -> None:
     author_tets(tmp_path / "a.usda", [cell], orientation=orientation, scale=(mirror, 1, 1)).Save()
-    points, cells = read_tet_mesh(tmp_path / "a.usda")
-    a, b, c, d = points[cells[0]]
+    read = read_mesh(tmp_path / "a.usda")
+    a, b, c, d = read.points[read.cells[0]]
     assert np.linalg.det([b - a, c - a, d - a]) == pytest.approx(1.0)
 
 
@@ -894,7 +957,7 @@ def test_a_tet_mesh_with_only_samples_is_read_at_the_first(tmp_path: Path) -> No
     for code in (7.0, 3.0):
         attr.Set(Vt.Vec3fArray.FromNumpy(TETRAHEDRON * np.float32(code)), code)
     stage.Save()
-    assert read_tet_mesh(tmp_path / "a.usda")[0] == pytest.approx(3.0 * TETRAHEDRON + (10, 0, 0))
+    assert read_mesh(tmp_path / "a.usda").points == pytest.approx(3.0 * TETRAHEDRON + (10, 0, 0))
 
 
 def test_surfaces_are_merged_and_cut_into_triangles(tmp_path: Path) -> None:
@@ -910,7 +973,8 @@ def test_surfaces_are_merged_and_cut_into_triangles(tmp_path: Path) -> None:
         if name == "hidden":
             mesh.CreatePurposeAttr("guide")
     stage.Save()
-    points, triangles = read_surface_mesh(path)
+    read = read_surface_mesh(path)
+    points, triangles = read.points, read.triangles
     assert points[:, 2].tolist() == [0.0] * 5 + [1.0] * 5
     fan = [[0, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3, 4]]
     assert triangles[:4].tolist() == fan
@@ -920,7 +984,8 @@ def test_surfaces_are_merged_and_cut_into_triangles(tmp_path: Path) -> None:
 
 def test_the_bear_that_comes_with_warp_is_closed_and_outward() -> None:
     examples = pytest.importorskip("warp.examples")
-    points, triangles = read_surface_mesh(Path(examples.get_asset_directory()) / "bear.usd")
+    read = read_surface_mesh(Path(examples.get_asset_directory()) / "bear.usd")
+    points, triangles = read.points, read.triangles
     assert (points.shape, triangles.shape) == ((1986, 3), (3968, 3))
     assert np.ptp(points, axis=0) == pytest.approx((4.89, 5.542, 9.78), abs=1e-3)
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
@@ -929,7 +994,7 @@ def test_the_bear_that_comes_with_warp_is_closed_and_outward() -> None:
     assert len(edges) == 3 * 3968 and all((end, start) in edges for start, end in edges)
 
 
-@pytest.mark.parametrize("read", [read_tet_mesh, read_surface_mesh])
+@pytest.mark.parametrize("read", [read_mesh, read_surface_mesh])
 def test_unreadable_meshes_are_errors(tmp_path: Path, read) -> None:
     write(tmp_path / "run.usdc", [make_body(3)], 1)
     whole = (tmp_path / "run.usdc").read_bytes()
@@ -953,13 +1018,13 @@ def test_unreadable_meshes_are_errors(tmp_path: Path, read) -> None:
 def test_meshes_that_make_no_sense_are_errors(tmp_path: Path) -> None:
     author_tets(tmp_path / "range.usda", [(0, 1, 2, 3), (0, 1, 2, 4)]).Save()
     with pytest.raises(MeshError, match="1 indices are outside of its 4 points, the first one is 4 at position 7"):
-        read_tet_mesh(tmp_path / "range.usda")
+        read_mesh(tmp_path / "range.usda")
     author_tets(tmp_path / "empty.usda", np.empty((0, 4))).Save()
     with pytest.raises(MeshError, match="/root/tets: the mesh is empty"):
-        read_tet_mesh(tmp_path / "empty.usda")
+        read_mesh(tmp_path / "empty.usda")
     write(tmp_path / "two.usdc", [make_body(3, "a"), make_body(3, "b")], 0)
     with pytest.raises(MeshError, match="/World/a/simulation, /World/b/simulation"):
-        read_tet_mesh(tmp_path / "two.usdc")
+        read_mesh(tmp_path / "two.usdc")
 
     stage = Usd.Stage.CreateNew(str(tmp_path / "counts.usda"))
     mesh = UsdGeom.Mesh.Define(stage, "/mesh")

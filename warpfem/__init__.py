@@ -11,7 +11,7 @@ wf.run(scene, "jelly.usdc")
 __version__ = "0.1.0"
 
 from warpfem import quantities
-from warpfem.boundary import BoxWalls, Pin, Plane, PointForce, PrescribedMotion, Sphere, Traction
+from warpfem.boundary import Box, BoxWalls, Pin, Plane, PointForce, PrescribedMotion, Sphere, Traction
 from warpfem.errors import (
     MaterialError,
     MeshError,
@@ -31,7 +31,7 @@ from warpfem.materials import (
     StVenantKirchhoff,
 )
 from warpfem.mesh import Mesh
-from warpfem.meshing import read_mesh, read_surface, tetrahedralize
+from warpfem.meshing import load_mesh, read_surface, tetrahedralize
 from warpfem.model import Energies, Model, State, Stresses
 from warpfem.moduli import ElasticModuli, elastic_moduli
 from warpfem.reactions import PointForces, Reactions, reactions
@@ -48,6 +48,7 @@ from warpfem.solvers import (
     SymplecticEuler,
     VelocityVerlet,
 )
+from warpfem.stage import read_stage
 from warpfem.static_run import run_static
 
 __all__ = [
@@ -57,6 +58,7 @@ __all__ = [
     "SOLVERS",
     "BackwardEuler",
     "Body",
+    "Box",
     "BoxWalls",
     "ElasticModuli",
     "Energies",
@@ -94,9 +96,10 @@ __all__ = [
     "VelocityVerlet",
     "WarpfemError",
     "elastic_moduli",
+    "load_mesh",
     "quantities",
     "reactions",
-    "read_mesh",
+    "read_stage",
     "read_surface",
     "record",
     "run",

@@ -20,6 +20,9 @@ PointSelection: TypeAlias = str | Sequence[int] | np.ndarray
 
 Vector: TypeAlias = Sequence[float]
 
+PERPENDICULAR = 1e-4
+"""The largest cosine between two directions that count as perpendicular."""
+
 
 def is_number(value: object) -> bool:
     """Whether it is one finite number that float64 can hold."""
@@ -177,6 +180,51 @@ class Sphere(_Obstacle):
 
 
 @dataclass(frozen=True)
+class Box(_Obstacle):
+    """A fixed solid box (2D: rectangle): bodies stay outside.
+
+    Contact is felt by a body's boundary points: what is smaller than the faces between them, such as a corner of the
+    box, slips through. A point that is inside is pushed out through the nearest side.
+
+    Attributes:
+        center: centre [m].
+        size: full lengths of the edges along ``axes`` [m], > 0.
+        axes: directions of the edges, perpendicular to each other and of any length; ``None`` for x, y and z.
+        friction: Coulomb coefficient, >= 0.
+        stiffness: pressure per depth [Pa/m]; ``None`` as for :class:`Plane`.
+    """
+
+    center: Vector
+    size: Vector
+    axes: Sequence[Vector] | None = None
+    friction: float = 0.0
+    stiffness: float | None = None
+
+    def __post_init__(self) -> None:
+        self._check()
+        object.__setattr__(self, "center", _vector("Box", "center", self.center))
+        object.__setattr__(self, "size", _vector("Box", "size", self.size))
+        dim = len(self.center)
+        if len(self.size) != dim or min(self.size) <= 0.0:
+            raise SceneError(f"Box: size {self.size} must be {dim} numbers above 0, one for each of center")
+        given = np.eye(dim).tolist() if self.axes is None else self.axes
+        rows = [_vector("Box", "axes", axis) for axis in given] if isinstance(given, Sequence | np.ndarray) else []
+        axes = np.array(
+            [np.array(row) / max(np.linalg.norm(row), np.finfo(float).tiny) for row in rows if len(row) == dim]
+        )
+        if len(rows) != dim or axes.shape != (dim, dim) or np.abs(axes @ axes.T - np.eye(dim)).max() > PERPENDICULAR:
+            raise SceneError(
+                f"Box: axes must be {dim} directions that are perpendicular to each other, not {self.axes!r}"
+            )
+        object.__setattr__(self, "axes", tuple(map(tuple, axes.tolist())))
+
+    @property
+    def shape(self) -> np.ndarray:
+        """Rows (dim, dim) [1/m] whose products with a place relative to the centre are within -1..1 inside the box."""
+        return np.array(self.axes) / (0.5 * np.array(self.size)[:, None])
+
+
+@dataclass(frozen=True)
 class BoxWalls(_Obstacle):
     """The inner walls of a fixed box: bodies stay inside.
 
@@ -209,4 +257,4 @@ class BoxWalls(_Obstacle):
 
 Support: TypeAlias = Pin | PrescribedMotion
 Load: TypeAlias = PointForce | Traction
-Obstacle: TypeAlias = Plane | Sphere | BoxWalls
+Obstacle: TypeAlias = Plane | Sphere | Box | BoxWalls

@@ -1,4 +1,4 @@
-"""Reads files in a child process, which may crash, hang or run out of memory without harm to this one.
+"""Works in a child process, which may crash, hang or run out of memory without harm to this one.
 
 Whoever made a file decides what a library does that reads it: the USD library ends the process on some damaged
 files, and a wrong count in a header takes all the memory there is.
@@ -44,8 +44,12 @@ serve(*arguments)
 _ENVIRONMENT = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
+class ChildError(Exception):
+    """A child did not do its work: says how it ended."""
+
+
 def read_in_child(read: Callable[[str], T], path: str | os.PathLike[str], error: type[WarpfemError]) -> T:
-    """Returns ``read(path)``, done in a child process that cannot take more than half of the machine's memory.
+    """Returns ``read(path)``, done in a child process within a time that goes with the file's size.
 
     Args:
         read: a function of a warpfem module; its result must be plain data.
@@ -53,18 +57,40 @@ def read_in_child(read: Callable[[str], T], path: str | os.PathLike[str], error:
         error: raised if the child dies, takes too long or raises anything but a :class:`WarpfemError`.
     """
     path = existing(path, error)
-    seconds = MIN_SECONDS + SECONDS_PER_BYTE * _size(path)
-    answer, status = _ask(read, path, seconds, error)
+    try:
+        return call_in_child(read, path, MIN_SECONDS + SECONDS_PER_BYTE * _size(path))
+    except WarpfemError:
+        raise
+    except ChildError as problem:
+        raise error(f"{path}: {DAMAGED} ({problem})") from problem
+    except OSError as problem:
+        raise error(f"{path}: no process could be started to read it: {problem}") from problem
+
+
+def call_in_child(call: Callable[[str], T], path: str | os.PathLike[str], seconds: float | None = None) -> T:
+    """Returns ``call(path)``, done in a child process that cannot take more than half of the machine's memory.
+
+    Args:
+        call: a function of a warpfem module; its result must be plain data.
+        path: what the function is given.
+        seconds: the time that it may take [s]; ``None`` for as long as it wants.
+
+    Raises:
+        OSError: no child can be started.
+        ChildError: it dies, takes too long or raises anything but a :class:`WarpfemError`.
+        WarpfemError: that which the function raised.
+    """
+    answer, status = _ask(call, path, seconds)
     if not answer:
-        raise error(f"{path}: {DAMAGED} (reading it {_ending(status, seconds)})")
+        raise ChildError(f"its process {_ending(status, seconds)}")
     kind, value, remarks = pickle.loads(answer)
     for remark in remarks:
-        warnings.warn(remark, stacklevel=4)
+        warnings.warn(remark, stacklevel=5)
     if kind == "value":
         return value
     if kind == "error":
         raise value
-    raise error(f"{path}: {DAMAGED} ({value})")
+    raise ChildError(value)
 
 
 def existing(path: object, error: type[WarpfemError]) -> Path:
@@ -85,24 +111,19 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in [path, *path.with_suffix("").glob("*")] if file.is_file())
 
 
-def _ask(
-    read: Callable, path: str | os.PathLike[str], seconds: float, error: type[WarpfemError]
-) -> tuple[bytes, int | None]:
+def _ask(call: Callable, path: str | os.PathLike[str], seconds: float | None) -> tuple[bytes, int | None]:
     """The child's answer, empty if it died, and how it ended: an exit status, or ``None`` for too late."""
     package = [os.path.abspath(folder) for folder in sys.modules["warpfem"].__path__]
     paths = [os.path.abspath(entry) for entry in sys.path]
-    request = json.dumps([paths, package, read.__module__, read.__qualname__, os.fspath(path), seconds])
-    try:
-        process = subprocess.Popen(
-            [sys.executable, "-I", "-c", _START, request],
-            stdin=subprocess.PIPE,  # closed when this process ends, which ends the child
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | _ENVIRONMENT,
-            process_group=0,  # Ctrl-C is for this process to handle
-        )
-    except OSError as problem:
-        raise error(f"{path}: no process could be started to read it: {problem}") from problem
+    request = json.dumps([paths, package, call.__module__, call.__qualname__, os.fspath(path), seconds])
+    process = subprocess.Popen(
+        [sys.executable, "-I", "-c", _START, request],
+        stdin=subprocess.PIPE,  # closed when this process ends, which ends the child
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | _ENVIRONMENT,
+        process_group=0,  # Ctrl-C is for this process to handle
+    )
     assert process.stdout is not None
     late = threading.Event()
 
@@ -110,11 +131,12 @@ def _ask(
         late.set()
         process.kill()
 
-    timer = threading.Timer(seconds, end)
+    timer = threading.Timer(seconds or 0.0, end)
     timer.daemon = True
     with process:
         try:
-            timer.start()
+            if seconds is not None:
+                timer.start()
             answer = process.stdout.read()
             status = process.wait()
         finally:
@@ -123,7 +145,7 @@ def _ask(
     return (answer if status == 0 else b""), (None if late.is_set() else status)
 
 
-def _ending(status: int | None, seconds: float) -> str:
+def _ending(status: int | None, seconds: float | None) -> str:
     if status is None:
         return f"took more than {seconds:.0f} s"
     return f"crashed with {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
@@ -132,7 +154,7 @@ def _ending(status: int | None, seconds: float) -> str:
 # ---- in the child
 
 
-def serve(module: str, function: str, path: str, seconds: float) -> NoReturn:
+def serve(module: str, function: str, path: str, seconds: float | None) -> NoReturn:
     """Calls a function with the path, writes its answer to the standard output, and exits."""
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # libraries print what they like
@@ -153,18 +175,17 @@ def serve(module: str, function: str, path: str, seconds: float) -> NoReturn:
     os._exit(0)  # destructors have nothing to save, and may crash
 
 
-def limit_resources(seconds: float) -> None:
-    """Limits memory and processor time, and writes no core file, where the system knows such limits."""
+def limit_resources(seconds: float | None) -> None:
+    """Limits memory and, unless it is ``None``, processor time [s]; writes no core file. Where the system can."""
     try:
         import resource
     except ImportError:
         return
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-    for kind, limit in (
-        (resource.RLIMIT_DATA, memory),  # files that are mapped do not count
-        (resource.RLIMIT_CPU, int(seconds) + 1),
-        (resource.RLIMIT_CORE, 0),
-    ):
+    limits = [(resource.RLIMIT_DATA, memory), (resource.RLIMIT_CORE, 0)]  # files that are mapped do not count
+    if seconds is not None:
+        limits.append((resource.RLIMIT_CPU, int(seconds) + 1))
+    for kind, limit in limits:
         _, most = resource.getrlimit(kind)
         resource.setrlimit(kind, (limit if most < 0 else min(limit, most), most))
 

@@ -8,11 +8,11 @@ import warnings
 from collections.abc import Sequence
 
 import warpfem
-from warpfem.commands import explain, extremes, info, preview, run, static, trade, tune
+from warpfem.commands import explain, extremes, info, plot, preview, run, static, trade, tune
 from warpfem.commands.session import FAILED, WRONG_USE, fail
 from warpfem.errors import SimulationError, TimeStepError, WarpfemError
 
-COMMANDS = (run, static, explain, trade, tune, preview, extremes, info)
+COMMANDS = (run, static, explain, trade, tune, preview, plot, extremes, info)
 """In the order of the help text."""
 
 

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warpfem.boundary import BoxWalls, Obstacle, Plane, Sphere
+from warpfem.boundary import Box, BoxWalls, Obstacle, Plane, Sphere
 from warpfem.dtypes import types
 from warpfem.launches import Launcher
 from warpfem.mesh import Mesh
@@ -30,32 +30,82 @@ gains as it falls."""
 
 @functools.cache
 def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
-    """The kernels for one kind of obstacle, :class:`Plane` or :class:`Sphere`.
+    """The kernels for one kind of obstacle, :class:`Plane`, :class:`Sphere` or :class:`Box`.
 
-    They take the obstacle as ``axis`` (the plane's normal; unused by a sphere) and ``radius`` (unused by a
-    plane), and as ``origin`` each surface point's rest place relative to its foot on the plane or to the
-    sphere's centre.
+    They take the obstacle as ``form``: the plane's normal, the sphere's radius or the box's :attr:`Box.shape`; and as
+    ``origin`` each surface point's rest place relative to its foot on the plane or to the obstacle's centre.
     """
     t = types(dim, dtype)
     vector, matrix, scalar = t.vector, t.matrix, t.scalar
     module = f"warpfem.contact_{kind.__name__.lower()}_{dim}_{dtype}"
 
     if kind is Plane:
+        form_type = vector
 
         @wp.func
-        def surface(y: vector, axis: vector, radius: scalar):
-            return wp.dot(axis, y), axis
+        def surface(y: vector, form: vector):
+            return wp.dot(form, y), form
 
-    else:
+    elif kind is Sphere:
+        form_type = scalar
 
         @wp.func
-        def surface(y: vector, axis: vector, radius: scalar):
+        def surface(y: vector, form: scalar):
             distance = wp.length(y)
             normal = vector()
             normal[1] = scalar(1.0)
             if distance > scalar(0.0):
                 normal = y / distance
-            return distance - radius, normal
+            return distance - form, normal
+
+        @wp.func
+        def core_entry(y: vector, p: vector, form: scalar):
+            core = scalar(0.5) * form
+            # |y + s p|^2 = core^2 at s = c / (b + sqrt(b^2 - a c)), b = -y . p > 0
+            b = -wp.dot(y, p)
+            c = wp.dot(y, y) - core * core
+            discriminant = b * b - wp.dot(p, p) * c
+            entry = scalar(-1.0)
+            if c > scalar(0.0) and b > scalar(0.0) and discriminant > scalar(0.0):
+                entry = c / (b + wp.sqrt(discriminant))
+            return entry
+
+    else:
+        form_type = matrix
+
+        @wp.func
+        def surface(y: vector, form: matrix):
+            place = form * y
+            gap = scalar(0.0)
+            normal = vector()
+            for i in range(dim):
+                row = form[i]
+                scale = scalar(1.0) / wp.length(row)
+                own = (wp.abs(place[i]) - scalar(1.0)) * scale
+                if i == 0 or own > gap:
+                    gap = own
+                    normal = (wp.sign(place[i]) * scale) * row
+            return gap, normal
+
+        @wp.func
+        def core_entry(y: vector, p: vector, form: matrix):
+            # between the planes place_i = -1/2 and 1/2 from ``enter`` to ``leave``, for all i at once
+            place = form * y
+            way = form * p
+            half = scalar(0.5)
+            enter = scalar(0.0)
+            leave = scalar(wp.inf)
+            for i in range(dim):
+                if way[i] != scalar(0.0):
+                    one = (-half - place[i]) / way[i]
+                    other = (half - place[i]) / way[i]
+                    enter = wp.max(enter, wp.min(one, other))
+                    leave = wp.min(leave, wp.max(one, other))
+                elif wp.abs(place[i]) > half:
+                    leave = scalar(-1.0)
+            if enter > leave or enter == scalar(0.0):
+                enter = scalar(-1.0)
+            return enter
 
     @wp.func
     def slip_weight(slip: scalar, limit: scalar):
@@ -71,8 +121,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
         stiffness: wp.array(dtype=scalar),
-        axis: vector,
-        radius: scalar,
+        form: form_type,
         friction: scalar,
         u: wp.array(dtype=vector),
         magnitude_out: wp.array(dtype=scalar),
@@ -80,7 +129,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
     ):
         """Writes the largest friction of each point, mu times its normal force, and its normal."""
         k = wp.tid()
-        gap, normal = surface(origin[k] + u[points[k]], axis, radius)
+        gap, normal = surface(origin[k] + u[points[k]], form)
         magnitude_out[k] = friction * stiffness[k] * wp.max(-gap, scalar(0.0))
         normal_out[k] = normal
 
@@ -89,14 +138,13 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
         stiffness: wp.array(dtype=scalar),
-        axis: vector,
-        radius: scalar,
+        form: form_type,
         u: wp.array(dtype=vector),
         energy_out: wp.array(dtype=wp.float64),
     ):
         """Adds k A g^2 / 2 to ``energy_out[0]``."""
         k = wp.tid()
-        gap, _normal = surface(origin[k] + u[points[k]], axis, radius)
+        gap, _normal = surface(origin[k] + u[points[k]], form)
         if gap < scalar(0.0):
             wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * stiffness[k] * gap * gap))
 
@@ -105,15 +153,14 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
         stiffness: wp.array(dtype=scalar),
-        axis: vector,
-        radius: scalar,
+        form: form_type,
         u: wp.array(dtype=vector),
         force_out: wp.array(dtype=vector),
     ):
         """Adds the normal forces."""
         k = wp.tid()
         i = points[k]
-        gap, normal = surface(origin[k] + u[i], axis, radius)
+        gap, normal = surface(origin[k] + u[i], form)
         if gap < scalar(0.0):
             force_out[i] += (-stiffness[k] * gap) * normal
 
@@ -122,41 +169,38 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
         stiffness: wp.array(dtype=scalar),
-        axis: vector,
-        radius: scalar,
+        form: form_type,
         u: wp.array(dtype=vector),
         blocks_out: wp.array(dtype=matrix),
     ):
         """Adds k A n n^T, the positive semi-definite part of the second derivative, to each point's block."""
         k = wp.tid()
         i = points[k]
-        gap, normal = surface(origin[k] + u[i], axis, radius)
+        gap, normal = surface(origin[k] + u[i], form)
         if gap < scalar(0.0):
             blocks_out[i] += stiffness[k] * wp.outer(normal, normal)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def core_limit(
-        points: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=vector),
-        radius: scalar,
-        u: wp.array(dtype=vector),
-        p: wp.array(dtype=vector),
-        limit_out: wp.array(dtype=scalar),
-    ):
-        """Lowers ``limit_out[0]`` to the least s > 0 at which u + s p takes a point outside of the core into it.
+    core_limit = None
+    if kind is not Plane:
 
-        The core is the sphere of half the radius.
-        """
-        k = wp.tid()
-        i = points[k]
-        y = origin[k] + u[i]
-        core = scalar(0.5) * radius
-        # |y + s p|^2 = core^2 at s = c / (b + sqrt(b^2 - a c)), b = -y . p > 0
-        b = -wp.dot(y, p[i])
-        c = wp.dot(y, y) - core * core
-        discriminant = b * b - wp.dot(p[i], p[i]) * c
-        if c > scalar(0.0) and b > scalar(0.0) and discriminant > scalar(0.0):
-            wp.atomic_min(limit_out, 0, c / (b + wp.sqrt(discriminant)))
+        @wp.kernel(module=module, enable_backward=False)
+        def core_limit(
+            points: wp.array(dtype=wp.int32),
+            origin: wp.array(dtype=vector),
+            form: form_type,
+            u: wp.array(dtype=vector),
+            p: wp.array(dtype=vector),
+            limit_out: wp.array(dtype=scalar),
+        ):
+            """Lowers ``limit_out[0]`` to the least s > 0 at which u + s p takes a point outside of the core into it.
+
+            The core is the obstacle at half its size.
+            """
+            k = wp.tid()
+            i = points[k]
+            entry = core_entry(origin[k] + u[i], p[i], form)
+            if entry > scalar(0.0):
+                wp.atomic_min(limit_out, 0, entry)
 
     @wp.func
     def slip_of(u: vector, u_start: vector, normal: vector):
@@ -275,9 +319,9 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
 
 
 class _ObstacleContact:
-    """One half-space or sphere against all surface points."""
+    """One half-space, sphere or box against all surface points."""
 
-    def __init__(self, obstacle: Plane | Sphere, surface: "ContactSurface", dtype: str) -> None:
+    def __init__(self, obstacle: Plane | Sphere | Box, surface: "ContactSurface", dtype: str) -> None:
         dim = surface.rest.shape[1]
         t = types(dim, dtype)
         self.kernels = contact_kernels(type(obstacle), dim, dtype)
@@ -287,34 +331,43 @@ class _ObstacleContact:
         self.count = len(surface.rest)
         self.points = surface.points
         if isinstance(obstacle, Plane):
-            axis, radius = obstacle.normal, 0.0
-            n = np.array(axis)
+            form: wp.vec3 | wp.mat33 | float = t.vector(*obstacle.normal)
+            n = np.array(obstacle.normal)
             origin = np.outer((surface.rest - np.array(obstacle.point)) @ n, n)  # the rest would cost digits
             outward = n
         else:
-            axis, radius = (0.0,) * dim, obstacle.radius
             origin = surface.rest - np.array(obstacle.center)
-            outward = origin / np.maximum(np.linalg.norm(origin, axis=1, keepdims=True), obstacle.radius)
+            if isinstance(obstacle, Sphere):
+                form = t.scalar(obstacle.radius)
+                outward = origin / np.maximum(np.linalg.norm(origin, axis=1, keepdims=True), obstacle.radius)
+            else:
+                form = t.matrix(*obstacle.shape.ravel())
+                places = origin @ np.array(obstacle.axes).T
+                nearest = np.argmax(np.abs(places) - 0.5 * np.array(obstacle.size), axis=1)[:, None]
+                outward = np.sign(np.take_along_axis(places, nearest, 1)) * np.array(obstacle.axes)[nearest[:, 0]]
         approach = np.maximum(-(surface.velocity * outward).sum(axis=1), 0.0)
         height = np.maximum(self._gap(obstacle, surface.rest), 0.0) + surface.stopping_depth
         fall = np.maximum(-(surface.gravity * outward).sum(axis=-1), 0.0) * height
         default = np.maximum(surface.stiffness, surface.stopping * (approach**2 + 2.0 * fall))
         pressure_rate = default if obstacle.stiffness is None else obstacle.stiffness
-        self.shape = [t.vector(*axis), t.scalar(radius)]
+        self.form = form
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
         self.host_stiffness = pressure_rate * surface.areas  # N/m
         self.stiffness = wp.array(self.host_stiffness, dtype=t.scalar, device=self.device)
         self._launch = Launcher(self.device)
-        self.normal_arguments = [self.points, self.origin, self.stiffness, *self.shape]
+        self.normal_arguments = [self.points, self.origin, self.stiffness, form]
         if self.friction > 0.0:
             self.magnitude = wp.zeros(self.count, dtype=t.scalar, device=self.device)
             self.normal = wp.zeros(self.count, dtype=t.vector, device=self.device)
 
     @staticmethod
-    def _gap(obstacle: Plane | Sphere, x: np.ndarray) -> np.ndarray:
-        """The distance of points from an obstacle, negative inside [m]."""
+    def _gap(obstacle: Plane | Sphere | Box, x: np.ndarray) -> np.ndarray:
+        """The distance of points from an obstacle, negative inside [m]; from a box at least."""
         if isinstance(obstacle, Plane):
             return (x - np.array(obstacle.point)) @ np.array(obstacle.normal)
+        if isinstance(obstacle, Box):
+            places = (x - np.array(obstacle.center)) @ np.array(obstacle.axes).T
+            return (np.abs(places) - 0.5 * np.array(obstacle.size)).max(axis=1)
         return np.linalg.norm(x - np.array(obstacle.center), axis=1) - obstacle.radius
 
     def depth(self, x: np.ndarray) -> float:
@@ -406,12 +459,12 @@ class Contact:
             # once for the walls of a box: those that a point can touch together are perpendicular
             self._host_stiffness += self.parts[-1].host_stiffness
         self._rough = [part for part in self.parts if part.friction > 0.0]
-        self._balls = [part for part in self.parts if isinstance(part.obstacle, Sphere)]
+        self._solids = [part for part in self.parts if not isinstance(part.obstacle, Plane)]
 
     @property
     def limits_steps(self) -> bool:
         """Whether there is an obstacle that a point could cross in one step and leave on the other side."""
-        return bool(self._balls)
+        return bool(self._solids)
 
     @property
     def rough(self) -> bool:
@@ -447,9 +500,9 @@ class Contact:
             part.launch("contact_blocks", [*part.normal_arguments, u], [blocks_out])
 
     def limit_step(self, u: wp.array, p: wp.array, limit_out: wp.array) -> None:
-        """Lowers ``limit_out[0]`` so far that u + s p takes no point into the core of a sphere."""
-        for part in self._balls:
-            part.launch("core_limit", [part.points, part.origin, part.shape[1], u, p], [limit_out])
+        """Lowers ``limit_out[0]`` so far that u + s p takes no point into the core of a sphere or box."""
+        for part in self._solids:
+            part.launch("core_limit", [part.points, part.origin, part.form, u, p], [limit_out])
 
     # Friction of one step: its limits are those at one u, then come the potential's terms at any trial u.
 

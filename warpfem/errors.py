@@ -32,8 +32,12 @@ class MissingExtraError(WarpfemError, ImportError):
 
     def __init__(self, purpose: str, package: str, extra: str) -> None:
         super().__init__(f"{purpose} needs the package '{package}': pip install 'warpfem[{extra}]'")
+        self.purpose = purpose
         self.package = package
         self.extra = extra
+
+    def __reduce__(self) -> tuple:  # it comes back from child processes
+        return MissingExtraError, (self.purpose, self.package, self.extra)
 
 
 class SimulationError(WarpfemError, RuntimeError):

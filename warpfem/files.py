@@ -9,10 +9,41 @@ from pathlib import Path
 
 import numpy as np
 
+from warpfem.errors import OutputError
+
 
 def beside(output: Path, ending: str) -> Path:
     """The file that belongs to an output: ``run.usdc`` and "checkpoint.npz" give ``run.checkpoint.npz``."""
     return output.with_name(f"{output.stem}.{ending}")
+
+
+def require_writable(path: Path) -> None:
+    """Checks what can be told of a file to write without writing anything.
+
+    Raises:
+        OutputError: a folder, a file that is write-protected, a name that the system does not bear, or a place that
+            cannot be written to.
+    """
+    try:
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder: give the name of a file")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise OutputError(f"{path} cannot be written: it is write-protected")
+        folder = existing_folder(path)
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            raise OutputError(f"{path} cannot be written: {folder} is not a folder that can be written to")
+    except (OSError, ValueError) as problem:
+        if isinstance(problem, OutputError):
+            raise
+        raise OutputError(f"{path} cannot be written: {problem}") from problem
+
+
+def existing_folder(path: Path) -> Path:
+    """The folder of a path, or the one that it will be made in."""
+    folder = path.absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    return folder
 
 
 def _temporary(path: Path) -> Path:

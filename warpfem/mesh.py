@@ -77,12 +77,14 @@ class Mesh:
             (1, 3), (2, 3); edges are curved where their midpoint is not halfway.
         point_sets: named sets of points, each an int32 index array.
         cell_sets: named sets of cells, likewise.
+        cell_data: named numbers of the cells, each (m,) float64, such as the moduli or densities that a mesh file has.
 
     Raises:
         MeshError: the arrays have the wrong shape or type, a point is not finite or belongs to no cell, a
             cell refers to a point that does not exist, repeats a point or another cell, is inverted or has
             no volume (mean-ratio quality of its corners below ``MIN_QUALITY``), midpoints fold a cell, are corners
-            of another one or differ between the cells of an edge, or a set is out of range or badly named.
+            of another one or differ between the cells of an edge, or a set is out of range or badly named, or cell
+            data are not one number per cell.
             :meth:`repaired` mends inverted cells and unused points.
     """
 
@@ -90,6 +92,7 @@ class Mesh:
     cells: np.ndarray
     point_sets: Mapping[str, np.ndarray] = field(default_factory=dict)
     cell_sets: Mapping[str, np.ndarray] = field(default_factory=dict)
+    cell_data: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         points, cells = _arrays(self.points, self.cells)
@@ -99,18 +102,23 @@ class Mesh:
             cells=_frozen(cells),
             point_sets=_sets("point", self.point_sets, len(points)),
             cell_sets=_sets("cell", self.cell_sets, len(cells)),
+            cell_data=_cell_data(self.cell_data, len(cells)),
         )
 
     def __repr__(self) -> str:
         names = "".join(
-            f", {kind} sets: {', '.join(sets)}"
-            for kind, sets in (("point", self.point_sets), ("cell", self.cell_sets))
-            if sets
+            f", {kind}: {', '.join(named)}"
+            for kind, named in (
+                ("point sets", self.point_sets),
+                ("cell sets", self.cell_sets),
+                ("cell data", self.cell_data),
+            )
+            if named
         )
         return f"Mesh({self.dim}D, {self.point_count} points, {self.cell_count} cells{names})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Mesh, (self.points, self.cells, dict(self.point_sets), dict(self.cell_sets))
+        return Mesh, (self.points, self.cells, dict(self.point_sets), dict(self.cell_sets), dict(self.cell_data))
 
     # ---- construction
 
@@ -121,6 +129,7 @@ class Mesh:
         cells: np.ndarray,
         point_sets: Mapping[str, Selection] = MappingProxyType({}),
         cell_sets: Mapping[str, Selection] = MappingProxyType({}),
+        cell_data: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> Mesh:
         """Make a mesh after turning inverted cells round and dropping points that no cell uses.
 
@@ -131,6 +140,7 @@ class Mesh:
             cells: (m, k) point indices, linear or quadratic, of either orientation.
             point_sets: indices into ``points`` by name; those of dropped points are dropped.
             cell_sets: indices into ``cells`` by name.
+            cell_data: (m,) numbers by name.
 
         Raises:
             MeshError: as for :class:`Mesh`, for everything else.
@@ -144,7 +154,7 @@ class Mesh:
         renumbered[used] = np.arange(len(used), dtype=np.int32)
         new_sets = {name: renumbered[s] for name, s in _sets("point", point_sets, len(points)).items()}
         new_sets = {name: members[members >= 0] for name, members in new_sets.items()}
-        return cls(points[used], renumbered[cells], new_sets, cell_sets)  # type: ignore[arg-type]
+        return cls(points[used], renumbered[cells], new_sets, cell_sets, cell_data)  # type: ignore[arg-type]
 
     @classmethod
     def rectangle(cls, size: Sequence[float], cells: Sequence[int], origin: Sequence[float] = (0.0, 0.0)) -> Mesh:
@@ -255,18 +265,20 @@ class Mesh:
         middles = self.point_count + places.reshape(self.cell_count, -1).astype(np.int32)
         sets = {name: self.with_midpoints(members) for name, members in self.point_sets.items()}
         points = np.concatenate([self.points, self.points[self.edges].mean(axis=1)])
-        return Mesh(points, np.concatenate([self.cells, middles], axis=1), sets, self.cell_sets)
+        return Mesh(points, np.concatenate([self.cells, middles], axis=1), sets, self.cell_sets, self.cell_data)
 
     def refined(self) -> Mesh:
         """Return the linear mesh with each cell divided into 4 (2D) or 8 (3D), at the midpoints of its edges.
 
         The midpoints follow the points, in the order of :meth:`quadratic`. A point set gains the midpoints between any
-        two of its points, and a cell set the parts of its cells: those of cell c are p c to p c + p - 1.
+        two of its points, and a cell set the parts of its cells: those of cell c are p c to p c + p - 1. They have the
+        data of their cell.
         """
         own = self.quadratic()
         parts = len(own.shape.parts)
         sets = {name: (parts * members[:, None] + np.arange(parts)).ravel() for name, members in self.cell_sets.items()}
-        return Mesh(own.points, own.linear_cells, own.point_sets, sets)
+        data = {name: np.repeat(values, parts) for name, values in self.cell_data.items()}
+        return Mesh(own.points, own.linear_cells, own.point_sets, sets, data)
 
     def with_midpoints(self, members: np.ndarray) -> np.ndarray:
         """Return points of this linear mesh, and the midpoints between them by their numbers in :meth:`quadratic`.
@@ -356,6 +368,42 @@ class Mesh:
                 "select every point of the faces, on the boundary"
             )
         return faces
+
+    def per_cell(self, values: Mapping[str, float]) -> np.ndarray:
+        """Return one number per cell from one number per cell set, as materials and densities take them.
+
+        ``NeoHookean(E=mesh.per_cell({"bone": 1e9, "muscle": 1e5}), nu=0.3)``
+
+        Args:
+            values: a number by the name of each cell set; together the sets must hold every cell.
+
+        Returns:
+            (m,) float64.
+
+        Raises:
+            MeshError: no set has that name, a value is no number, a cell is in none of the sets, or in several with
+                different numbers.
+        """
+        result = np.full(self.cell_count, np.nan)
+        for name, value in values.items():
+            members = self.select_cells(name)
+            if not is_number(value):
+                raise MeshError(f"per_cell: the value of {name!r} must be a finite number, not {value!r}")
+            taken = np.isfinite(result[members]) & (result[members] != value)
+            if taken.any():
+                raise MeshError(
+                    f"per_cell: cell {members[taken][0]} ({taken.sum()} in all) is in {name!r} and in another set with "
+                    "another value: give sets that do not overlap"
+                )
+            result[members] = value
+        missing = np.flatnonzero(np.isnan(result))
+        if len(missing):
+            others = ", ".join(map(repr, [name for name in self.cell_sets if name not in values])) or "none"
+            raise MeshError(
+                f"per_cell: cell {missing[0]} ({len(missing)} in all) is in none of {', '.join(map(repr, values))}; "
+                f"other cell sets of the mesh: {others}"
+            )
+        return result
 
     # ---- size and shape
 
@@ -629,7 +677,7 @@ def _arrays(points: object, cells: object) -> tuple[np.ndarray, np.ndarray]:
     if dim == 3 and indices.ndim == 2 and indices.shape[1] in (3, 6):
         raise MeshError(
             "triangles with points in 3D are a surface, not a solid: fill it with "
-            "warpfem.meshing.tetrahedralize, or give points (n, 2) for a plane body"
+            "warpfem.tetrahedralize, or give points (n, 2) for a plane body"
         )
     if indices.ndim != 2 or shape_of_points(dim, indices.shape[1]) is None:
         kind = "(m, 3) or (m, 6) triangles" if dim == 2 else "(m, 4) or (m, 10) tetrahedra"
@@ -716,6 +764,20 @@ def _sets(kind: str, sets: Mapping[str, Any], count: int) -> Mapping[str, np.nda
     return MappingProxyType(
         {name: _frozen(_indices(kind, f"{kind} set {name!r}", value, count)) for name, value in sets.items()}
     )
+
+
+def _cell_data(data: object, count: int) -> Mapping[str, np.ndarray]:
+    if not isinstance(data, Mapping):
+        raise MeshError(f"cell_data must be a dict from names to one number per cell, not {data!r}")
+    checked = {}
+    for name, values in data.items():
+        if not isinstance(name, str) or not name:
+            raise MeshError(f"the name of cell data must be a non-empty str, not {name!r}")
+        array = _array(f"cell data {name!r}", values, "biuf", "one number per cell")
+        if array.shape != (count,):
+            raise MeshError(f"cell data {name!r} must have one number for each of {count} cells, not {array.shape}")
+        checked[name] = _frozen(array.astype(np.float64))
+    return MappingProxyType(checked)
 
 
 def _described(kind: str, selection: object) -> str:

@@ -283,6 +283,14 @@ class Model:
     Points and cells of all bodies are numbered through in the order of the scene's bodies. A term that the
     scene lacks is ``None`` here: it has no array and no kernel.
 
+    Args:
+        scene: the scene.
+        device: Warp device; ``None`` takes Warp's default.
+        dtype: "float32" or "float64".
+        threads: threads of the CPU that steps may use; ``None`` takes all cores.
+        lumped_mass: mass of each point [kg], (point_count,) float64 > 0, in place of what the densities give; they
+            should not give a point more than that, since stability limits are those of the cells.
+
     Attributes:
         scene: the scene.
         device: Warp device.
@@ -303,7 +311,13 @@ class Model:
     """
 
     def __init__(
-        self, scene: Scene, *, device: str | None = None, dtype: FloatName = "float32", threads: int | None = None
+        self,
+        scene: Scene,
+        *,
+        device: str | None = None,
+        dtype: FloatName = "float32",
+        threads: int | None = None,
+        lumped_mass: np.ndarray | None = None,
     ) -> None:
         if not isinstance(scene, Scene):
             raise SceneError(f"a model is made of a warpfem.Scene, not of {scene!r}")
@@ -323,7 +337,7 @@ class Model:
         self.cell_starts = np.concatenate([[0], np.cumsum([mesh.cell_count for mesh in meshes])])
         self.point_count = int(self.point_starts[-1])
         self.cell_count = int(self.cell_starts[-1])
-        self.host_mass = _lumped_mass(scene)
+        self.host_mass = _lumped_mass(scene) if lumped_mass is None else lumped_mass
         self.mass = self._device_array(self.host_mass, self.types.scalar)
         self.inverse_mass = self._device_array(1.0 / self.host_mass, self.types.scalar)
         self.blocks = self._cell_blocks()

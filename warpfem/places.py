@@ -38,7 +38,7 @@ class Places:
         return np.einsum("ka,ka...->k...", self.weights, field[self.cells])
 
 
-def locate(mesh: Mesh, places: np.ndarray) -> Places:
+def locate(mesh: Mesh, places: np.ndarray, extrapolate: bool = False) -> Places:
     """Finds the cells that contain places.
 
     Places outside of the mesh, up to half a cell's height, are extrapolated to from the nearest cell.
@@ -46,6 +46,7 @@ def locate(mesh: Mesh, places: np.ndarray) -> Places:
     Args:
         mesh: the mesh.
         places: rest positions (k, dim) [m].
+        extrapolate: places that are farther outside are extrapolated to from the cell with the nearest centre.
 
     Raises:
         MeshError: a place is not in the mesh.
@@ -65,11 +66,13 @@ def locate(mesh: Mesh, places: np.ndarray) -> Places:
         first, last = np.searchsorted(starts, [place[0] - widest, place[0]], side="right")
         near = order[first:last]
         near = near[((lower[near] <= place) & (place <= upper[near])).all(axis=1)]
-        inner = np.einsum("cij,cj->ci", inverse[near], place - corners[near, 0])
-        barycentric = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+        barycentric = _barycentric(place, corners[near, 0], inverse[near])
+        if not len(near) or barycentric.min(axis=1).max() < -MOST_OUTSIDE:
+            if not extrapolate:
+                raise MeshError(f"the place {place.tolist()} is not in the body")
+            near = np.argmin(((corners.mean(axis=1) - place) ** 2).sum(axis=1), keepdims=True)
+            barycentric = _barycentric(place, corners[near, 0], inverse[near])
         depth = barycentric.min(axis=1)
-        if not len(near) or depth.max() < -MOST_OUTSIDE:
-            raise MeshError(f"the place {place.tolist()} is not in the body")
         # of the cells that share a place the one of the least number, whatever rounding says
         best = int(near[depth >= min(-ROUNDING, float(depth.max()))].min())
         cells[index], coordinates[index] = best, barycentric[near == best][0]
@@ -77,6 +80,12 @@ def locate(mesh: Mesh, places: np.ndarray) -> Places:
     if mesh.order == 2:
         coordinates = _curved(mesh, cells, coordinates, places)
     return Places(mesh.cells[cells], own.values(coordinates))
+
+
+def _barycentric(place: np.ndarray, origins: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (c, dim + 1) of a place in cells with these first corners and inverted edges."""
+    inner = np.einsum("cij,cj->ci", inverse, place - origins)
+    return np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
 
 
 def _curved(mesh: Mesh, cells: np.ndarray, coordinates: np.ndarray, places: np.ndarray) -> np.ndarray:

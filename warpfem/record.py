@@ -15,9 +15,11 @@ from warpfem.dtypes import FloatName
 from warpfem.errors import OutputError, SimulationError
 from warpfem.failure import failure_path, save_failure
 from warpfem.files import remove
+from warpfem.log import RunLog
 from warpfem.model import Model
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, Simulation, Summary
+from warpfem.stage import physics_of
 
 if TYPE_CHECKING:
     from warpfem.usd import BodyFrame, UsdBody
@@ -30,6 +32,8 @@ def record(
     checkpoint_every: int | None = None,
     resume: bool = False,
     recipe: str = "",
+    log: str | Path | None = None,
+    over: str | Path | None = None,
 ) -> Generator[Frame, None, None]:
     """Runs a simulation and stores each frame in the USD file ``path`` while the next one is computed.
 
@@ -46,16 +50,23 @@ def record(
         resume: go on after the checkpoint of an earlier run of the same scene, with the frames that it left.
             The frames after the checkpoint are computed again, and yielded.
         recipe: what the scene was made by, for :meth:`Checkpoint.with_meshes`.
+        over: the USD stage that the scene was read from: ``path`` then becomes a layer over it, with nothing but the
+            motion. Such runs have no checkpoints.
+
+        log: a ``.csv`` or ``.jsonl`` that gets a line per frame, of energies, extremes, the solver's work and mean
+            displacements: see :class:`warpfem.log.RunLog`. A resumed run goes on in it.
 
     Raises:
-        OutputError: the file cannot be written; there is nothing to resume, or it is of another scene. Said
+        OutputError: the file or the log cannot be written; there is nothing to resume, or it is of another scene. Said
             before the first step where that can be known, and then nothing has been changed.
         SimulationError: the run cannot go on; the frames so far are in the file.
     """
-    from warpfem.usd import BackgroundWriter, UsdWriter
+    from warpfem.usd import BackgroundWriter, FrameWriter, OverWriter, UsdWriter
 
     if checkpoint_every is not None and not (isinstance(checkpoint_every, int) and checkpoint_every >= 1):
         raise OutputError(f"checkpoint_every must be a number of frames of at least 1, not {checkpoint_every!r}")
+    if over is not None and (checkpoint_every or resume):
+        raise OutputError(f"{path}: a layer over a stage has no checkpoints: run without, or without the stage")
     scene, summary = simulation.scene, simulation.summary
     checkpoint_file, failure_file = checkpoint_path(path), failure_path(path)
     for file in (checkpoint_file, failure_file):
@@ -68,18 +79,26 @@ def record(
         start.require_fit(simulation, parts, checkpoint_file)
         frame = simulation.restore(start.frame, start.time, start.displacement, start.velocity)
         keep = start.frame, body_frames(simulation.model, frame)
-    usd_writer = UsdWriter(
-        path,
-        usd_bodies(scene),
-        fps=scene.fps,
-        up_axis=scene.up_axis,
-        obstacles=scene.obstacles,
-        color_by=scene.color_by,
-        comment=f"warpfem {__version__}",
-        keep=keep,
-        expected_frames=scene.frames + 1,
-    )
-    with BackgroundWriter(usd_writer) as writer:
+    run_log = None if log is None else RunLog(log, simulation, None if start is None else start.frame)
+    comment, expected_frames = f"warpfem {__version__}", scene.frames + 1
+    usd_writer: FrameWriter
+    if over is not None:
+        names = [body.name for body in scene.bodies]
+        usd_writer = OverWriter(path, over, names, fps=scene.fps, comment=comment, expected_frames=expected_frames)
+    else:
+        usd_writer = UsdWriter(
+            path,
+            usd_bodies(scene),
+            fps=scene.fps,
+            up_axis=scene.up_axis,
+            obstacles=scene.obstacles,
+            physics=physics_of(scene),
+            color_by=scene.color_by,
+            comment=comment,
+            keep=keep,
+            expected_frames=expected_frames,
+        )
+    with BackgroundWriter(usd_writer) as writer, run_log or contextlib.nullcontext():
         _remove(failure_file)
         if start is None:
             _remove(checkpoint_file)
@@ -88,11 +107,15 @@ def record(
 
         def save_checkpoint(index: int) -> None:
             writer.flush()
+            if run_log:
+                run_log.save()
             Checkpoint.of(simulation, index, parts, recipe).write(checkpoint_file)
 
         with _failure_saved(simulation, failure_file):
             for frame in simulation.frames():
                 writer.write_frame(body_frames(simulation.model, frame))
+                if run_log:
+                    run_log.add(frame)
                 if checkpoint_every and frame.index % checkpoint_every == 0:
                     save_checkpoint(frame.index)
                 try:
@@ -113,6 +136,8 @@ def run(
     checkpoint_every: int | None = None,
     resume: bool = False,
     threads: int | None = None,
+    log: str | Path | None = None,
+    over: str | Path | None = None,
 ) -> Summary:
     """Runs a scene and stores it in the USD file ``path``, which is overwritten if it exists.
 
@@ -124,6 +149,8 @@ def run(
         checkpoint_every: frames between two checkpoints; ``None`` writes none.
         resume: go on after the checkpoint of an earlier run, which differs in the number of frames at most.
         threads: threads of the CPU that steps may use; ``None`` takes all cores. Results are the same.
+        log: a ``.csv`` or ``.jsonl`` that gets a line per frame; ``None`` writes none.
+        over: the USD stage that the scene was read from, for a layer over it; see :func:`record`.
 
     Returns:
         What the run did, with what came before the checkpoint.
@@ -132,7 +159,7 @@ def run(
         SceneError, OutputError, SimulationError: as :class:`Simulation` and :func:`record`.
     """
     simulation = Simulation(scene, device=device, dtype=dtype, threads=threads)
-    for _ in record(simulation, path, checkpoint_every=checkpoint_every, resume=resume):
+    for _ in record(simulation, path, checkpoint_every=checkpoint_every, resume=resume, log=log, over=over):
         pass
     return simulation.summary
 

@@ -228,7 +228,7 @@ class Scene:
             stability limit for explicit solvers, what its error target allows for a solver that has one, and the frame
             interval for other implicit ones, which is too long to follow motion that is not much slower.
         gravity: acceleration [m/s^2]; ``None`` for none.
-        obstacles: planes, spheres and box walls.
+        obstacles: planes, spheres, boxes and box walls.
         damping: mass-proportional damping alpha [1/s], >= 0: the force -alpha m v.
         fps: frames per second of simulated time, > 0.
         frames: frames to simulate after the initial one, >= 0.
@@ -283,7 +283,7 @@ class Scene:
         _require_list("obstacles", self.obstacles)
         for obstacle in self.obstacles:
             if not isinstance(obstacle, Obstacle):
-                raise SceneError(f"an obstacle must be a Plane, Sphere or BoxWalls, not {obstacle!r}")
+                raise SceneError(f"an obstacle must be a Plane, Sphere, Box or BoxWalls, not {obstacle!r}")
             vector = getattr(obstacle, "point", getattr(obstacle, "center", getattr(obstacle, "lower", ())))
             self._check_vector(f"{type(obstacle).__name__}: its place", vector)
         self._check_quantities()

@@ -1,4 +1,4 @@
-"""Scene files: Python files that define ``scene(**parameters) -> Scene``."""
+"""Scene files: Python files that define ``scene(**parameters) -> Scene``, and USD stages."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from typing import Any
 
 from warpfem.errors import SceneError, user_code
 from warpfem.scene import Scene
+from warpfem.stage import STEP, SUFFIXES, read_stage, stage_files
 
 
 def load_scene(path: str | Path, settings: Mapping[str, str] | None = None) -> Scene:
-    """Runs a scene file and calls its ``scene`` function.
+    """Runs a scene file and calls its ``scene`` function, or reads a USD stage (:func:`warpfem.read_stage`).
 
     Args:
-        path: the file; its code is executed.
+        path: the file; the code of a Python file is executed.
         settings: values for parameters of ``scene``, as text; each is read as a Python literal where the
             parameter's default is not a string.
 
@@ -43,7 +44,7 @@ def load_scene(path: str | Path, settings: Mapping[str, str] | None = None) -> S
 
 
 def scene_parameters(path: str | Path) -> Mapping[str, inspect.Parameter]:
-    """The parameters of a scene file's function ``scene``, by name.
+    """The parameters of a scene file's function ``scene``, or of a USD stage, by name.
 
     Raises:
         SceneError: as :func:`load_scene`.
@@ -53,7 +54,7 @@ def scene_parameters(path: str | Path) -> Mapping[str, inspect.Parameter]:
 
 
 def source_digest(path: str | Path) -> str:
-    """Names what a scene file says: its contents, and those of the neighbours that it imports, directly or not.
+    """Names what a scene file says: its contents, and those of the files that it imports or refers to.
 
     Raises:
         SceneError: no such file.
@@ -62,6 +63,8 @@ def source_digest(path: str | Path) -> str:
     if not path.is_file():
         raise SceneError(f"no scene file '{path}'")
     digest, found, left = hashlib.sha256(), {path}, [path]
+    if path.suffix.lower() in SUFFIXES:
+        left = [Path(file) for file in stage_files(path)]
     while left:
         file = left.pop()
         contents = file.read_bytes()
@@ -99,8 +102,12 @@ def _neighbours(folder: Path, name: str) -> list[Path]:
 def _scene_function(path: Path) -> Callable[..., Any]:
     if not os.path.isfile(path):  # unlike the path's own method it bears any name
         raise SceneError(f"no scene file '{path}'")
+    if path.suffix.lower() in SUFFIXES:
+        return _stage_function(path)
     if path.suffix != ".py":
-        raise SceneError(f"'{path}' is not a scene file: it must end in .py and define scene() -> Scene")
+        raise SceneError(
+            f"'{path}' is not a scene file: it must end in .py and define scene() -> Scene, or be a USD stage"
+        )
     name = f"warpfem_scene_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None  # given for every existing .py file
@@ -112,6 +119,13 @@ def _scene_function(path: Path) -> Callable[..., Any]:
     if not callable(function):
         raise SceneError(f"{path} does not define a function scene(**parameters) -> Scene")
     return function
+
+
+def _stage_function(path: Path) -> Callable[..., Any]:
+    def scene(dt: float = STEP) -> Scene:
+        return read_stage(path, dt)
+
+    return scene
 
 
 def _call(path: Path, action: Callable[[], Any]) -> Any:

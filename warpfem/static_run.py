@@ -20,6 +20,7 @@ from warpfem.record import body_frames, usd_bodies
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, observe
 from warpfem.solvers.static import StaticEquilibrium, at_rest, require_solvable
+from warpfem.stage import physics_of
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,9 @@ def record_static(run: StaticRun, path: str | Path) -> Generator[Frame, None, No
         fps=scene.fps,
         up_axis=scene.up_axis,
         obstacles=scene.obstacles,
+        physics=physics_of(scene),
         color_by=scene.color_by,
+        equilibria=True,
         comment=f"warpfem {__version__}",
     ) as writer:
         for frame in chain(first, frames):

@@ -12,13 +12,16 @@ from warpfem.commands.session import OK, start_warp
 
 EXTRAS = {
     "meshio": "mesh",
+    "trimesh": "mesh",
     "pytetwild": "tet",
     "matplotlib": "plot",
     "pillow": "plot",
+    "imageio-ffmpeg": "video",
     "tqdm": "progress",
     "scipy": "bench",
     "scikit-fem": "bench",
     "distributed": "cluster",
+    "newton": "newton",
 }
 """Optional packages and the extra that brings them."""
 

@@ -10,10 +10,14 @@ from warpfem.dtypes import FloatName
 from warpfem.errors import WarpfemError
 from warpfem.scene import Scene
 
+SCENE_HELP = "a Python file that defines scene() -> Scene, or a USD stage with physics on it"
+
 
 def scene_options(parser: argparse.ArgumentParser, dtype: FloatName = "float32") -> None:
     """The scene and how it is computed; ``dtype`` is what is taken unless --dtype or --settings say otherwise."""
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
+    parser.add_argument(
+        "scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene, or a USD stage"
+    )
     parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
     parser.add_argument("--dtype", choices=("float32", "float64"), help=f"default: {dtype}")
     parser.set_defaults(default_dtype=dtype)
@@ -43,7 +47,9 @@ def time_options(parser: argparse.ArgumentParser) -> None:
 
 def study_options(parser: argparse.ArgumentParser) -> None:
     """The scene of a study, and what its errors are of."""
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene")
+    parser.add_argument(
+        "scene", type=Path, metavar="SCENE", help="a Python file that defines scene() -> Scene, or a USD stage"
+    )
     set_option(parser)
     parser.add_argument("--device", metavar="D", help="Warp device, for example cpu or cuda:0")
     parser.add_argument("--frames", type=positive, metavar="N", help="frames to simulate after the initial one")

@@ -9,7 +9,7 @@ from warpfem.checkpoint import checkpoint_path
 from warpfem.errors import OutputError
 
 
-def require_consent(out: Path) -> None:
+def require_consent(out: Path, log: Path | None = None) -> None:
     """Asks before what an earlier run left is replaced; refuses where nobody can be asked.
 
     Raises:
@@ -18,7 +18,7 @@ def require_consent(out: Path) -> None:
     from warpfem.usd import partial_path
 
     partial = partial_path(out)
-    found = [f"{out} exists"] if out.exists() else []
+    found = [f"{path} exists" for path in (out, log) if path is not None and path.exists()]
     if partial.exists():
         found.append(f"{_frames_in(partial)} in {partial}, of a run that was killed")
     if not found:
@@ -31,7 +31,8 @@ def require_consent(out: Path) -> None:
         if sys.stdin.readline().strip().lower() in ("y", "yes"):
             return
         raise OutputError("nothing was run, and nothing overwritten")
-    raise OutputError(f"{text}: use --overwrite to replace it, or another --out")
+    other = "--log" if found == [f"{log} exists"] else "--out"
+    raise OutputError(f"{text}: use --overwrite to replace it, or another {other}")
 
 
 def kept(out: Path) -> str:
@@ -45,12 +46,15 @@ def kept(out: Path) -> str:
 
 
 def _frames_in(path: Path) -> str:
-    from warpfem.usd import read_animation
+    from warpfem.usd import frames_over, read_animation
 
     try:
         count = read_animation(path).frame_count
     except OutputError:
-        return "no readable frames are"
+        try:
+            count = frames_over(path)
+        except OutputError:
+            return "no readable frames are"
     return "1 frame is" if count == 1 else f"{count} frames are"
 
 

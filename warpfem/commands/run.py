@@ -17,10 +17,12 @@ from warpfem.checkpoint import Checkpoint, checkpoint_path
 from warpfem.commands.options import load, positive, scene_options, time_options
 from warpfem.commands.output import kept, require_consent
 from warpfem.commands.session import FAILED, OK, fail, held_interrupt, start_warp
-from warpfem.errors import SimulationError, WarpfemError
+from warpfem.errors import OutputError, SimulationError, WarpfemError
+from warpfem.log_file import check_log_path
 from warpfem.record import record
 from warpfem.scene_file import source_digest
 from warpfem.simulation import Frame, Simulation, Summary
+from warpfem.stage import SUFFIXES
 
 
 def add(commands: Any) -> None:
@@ -29,6 +31,18 @@ def add(commands: Any) -> None:
     scene_options(run)
     time_options(run)
     run.add_argument("--out", type=Path, metavar="F", help="output .usdc, .usd or .usda (default: output/SCENE.usdc)")
+    run.add_argument(
+        "--log",
+        type=Path,
+        metavar="F",
+        help=".csv or .jsonl that gets a line per frame: energies, extremes, the solver's work, and the mean "
+        "displacements of bodies and point sets (see warpfem plot)",
+    )
+    run.add_argument(
+        "--over",
+        action="store_true",
+        help="write a layer over the USD stage that is run: the stage as it is, and its bodies moving",
+    )
     run.add_argument(
         "--checkpoint-every",
         type=positive,
@@ -59,14 +73,18 @@ def execute(arguments: argparse.Namespace) -> int:
     scene = load(arguments)
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.usdc"
     with held_interrupt() as check_interrupt:
-        from warpfem.usd import check_path
+        from warpfem.usd import check_path, require_other_file
     check_interrupt()
     check_path(out)
+    require_other_file(out, arguments.scene)
+    _require_stage(arguments)
+    if arguments.log:
+        check_log_path(arguments.log)
     recipe = _recipe(arguments)
     if arguments.resume:
         scene = Checkpoint.read(checkpoint_path(out)).with_meshes(scene, recipe)
     elif not arguments.overwrite:
-        require_consent(out)
+        require_consent(out, arguments.log)
     say = not (arguments.quiet or arguments.json)
     if say:
         print(f"{arguments.scene}: preparing (the first run of a scene compiles its kernels)", file=sys.stderr)
@@ -80,6 +98,8 @@ def execute(arguments: argparse.Namespace) -> int:
             checkpoint_every=arguments.checkpoint_every,
             resume=arguments.resume,
             recipe=recipe,
+            log=arguments.log,
+            over=arguments.scene if arguments.over else None,
         )
         with held_interrupt() as check_interrupt, closing(recording) as frames:
             for _ in _progress(frames, scene.frames + 1) if say else frames:
@@ -105,8 +125,16 @@ def execute(arguments: argparse.Namespace) -> int:
     elif not arguments.quiet:
         print(_summary_text(summary, simulation))
         if code == OK:
-            print(f"wrote {out}")
+            print(f"wrote {out}" + (f" and {arguments.log}" if arguments.log else ""))
     return code
+
+
+def _require_stage(arguments: argparse.Namespace) -> None:
+    """Raises OutputError for --over with what cannot go over a stage."""
+    if arguments.over and arguments.scene.suffix.lower() not in SUFFIXES:
+        raise OutputError(f"--over writes a layer over a USD stage, and {arguments.scene} is none")
+    if arguments.over and (arguments.resume or arguments.checkpoint_every):
+        raise OutputError("--over cannot be resumed: leave out --resume and --checkpoint-every")
 
 
 def _recipe(arguments: argparse.Namespace) -> str:

@@ -276,7 +276,7 @@ class IncrementalPotential:
         return min(1.0, 0.9 * float(self._limit.numpy()[0]))
 
     def crosses_an_obstacle(self, u: wp.array, way: wp.array) -> bool:
-        """Whether the straight way of a point from u leads through the core of a sphere."""
+        """Whether the straight way of a point from u leads through the core of an obstacle."""
         contact = self.model.contact
         if contact is None or not contact.limits_steps:
             return False

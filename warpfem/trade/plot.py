@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from warpfem.errors import MissingExtraError, OutputError
+from warpfem.plot import COLORS
 from warpfem.trade.front import Candidate, label, percent
 from warpfem.trade.report import failure_lines
 from warpfem.trade.sweep import Sweep
-
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Told apart by all (Okabe and Ito 2008)."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
 

@@ -7,17 +7,17 @@ from collections.abc import Sequence
 from types import TracebackType
 
 from warpfem.usd.bodies import BodyFrame
-from warpfem.usd.writer import UsdWriter
+from warpfem.usd.frames import FrameWriter
 
 
 class BackgroundWriter:
-    """A :class:`UsdWriter` that works in a thread: one frame at a time, in order.
+    """A :class:`FrameWriter` that works in a thread: one frame at a time, in order.
 
     What goes wrong with a frame is raised by the next call, or at the end of the ``with`` block. After it all frames
     before that one are in the file, as with the writer itself.
     """
 
-    def __init__(self, writer: UsdWriter) -> None:
+    def __init__(self, writer: FrameWriter) -> None:
         self._writer = writer
         self._thread: threading.Thread | None = None
         self._error: Exception | None = None
@@ -29,7 +29,7 @@ class BackgroundWriter:
             frames: one per body; the arrays must stay as they are.
 
         Raises:
-            OutputError: the frame before could not be stored: see :meth:`UsdWriter.write_frame`.
+            OutputError: the frame before could not be stored: see :meth:`FrameWriter.write_frame`.
         """
         self._wait()
         self._thread = threading.Thread(target=self._write, args=(frames,), name="UsdWriter")

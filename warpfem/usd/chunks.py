@@ -13,7 +13,8 @@ from pxr import Sdf, Tf, Vt
 
 from warpfem.errors import OutputError
 from warpfem.files import beside, remove, replacing, settle
-from warpfem.usd.prims import WORLD, set_clock
+from warpfem.usd.clock import Clock
+from warpfem.usd.prims import WORLD
 from warpfem.usd.saved import Chunk, partial_path
 from warpfem.usd.stages import trust
 
@@ -23,6 +24,8 @@ Samples: TypeAlias = dict[Sdf.Path, Any]
 _PATIENCE = 0.5
 # Merging writes to disk each time that this much has come together [bytes].
 _MERGE_BYTES = 64 << 20
+# What the layers of a file do not have in common.
+_OWN_INFO = ("subLayers", "subLayerOffsets")
 
 
 class ChunkedLayer:
@@ -44,9 +47,11 @@ class ChunkedLayer:
         output: Path,
         static: Sdf.Layer,
         animated: Iterable[Sdf.Path],
+        clock: Clock,
         frames_per_chunk: int,
         metadata: dict[str, Any],
         kept: Sequence[Chunk] = (),
+        base: str = "",
     ) -> None:
         """Replaces what an earlier run left under the same name, but for the frames to keep.
 
@@ -56,9 +61,11 @@ class ChunkedLayer:
             output: the file that :meth:`merge` will write.
             static: everything but samples.
             animated: the attributes of ``static`` that have samples.
+            clock: the time codes of frames.
             frames_per_chunk: the most frames in one chunk.
-            metadata: custom data of the default prim.
+            metadata: custom data of ``/World``; without any it is left alone.
             kept: the first frames, of this file's predecessor or of a finished one.
+            base: the layer that the file goes over, relative to its folder.
 
         Raises:
             OSError, Tf.ErrorException, OutputError: the files cannot be written.
@@ -68,6 +75,8 @@ class ChunkedLayer:
         self._folder = beside(output, "partial")
         self._static = static
         self._animated = tuple(animated)
+        self._clock = clock
+        self._base = base
         self._frames_per_chunk = frames_per_chunk
         self._manifest = Sdf.Layer.CreateAnonymous(".usdc")
         for path in self._animated:
@@ -111,7 +120,7 @@ class ChunkedLayer:
         layer.TransferContent(self._manifest)
         for frame, samples in zip(frames, self._pending, strict=True):
             for path, value in samples.items():
-                layer.SetTimeSample(path, frame, value)
+                layer.SetTimeSample(path, self._clock.code(frame), value)
         chunk = Chunk(frames, self._place(frames))
         self._export(layer, chunk.path)
         self._write_root(metadata, chunk)
@@ -146,15 +155,17 @@ class ChunkedLayer:
     def _write_merged(self, path: Path, metadata: dict[str, Any], amend: Callable[[Samples], Samples]) -> None:
         merged = Sdf.Layer.CreateNew(str(path))
         merged.TransferContent(self._static)
+        self._go_over_base(merged)
         self._describe(merged, metadata)
         unsaved = 0.0
         for chunk in self._chunks:
             layer = chunk.open()
             frame_bytes = chunk.path.stat().st_size / len(chunk.frames)
             for frame in chunk.frames:
-                samples = {attribute: layer.QueryTimeSample(attribute, frame) for attribute in self._animated}
+                code = self._clock.code(frame)
+                samples = {attribute: layer.QueryTimeSample(attribute, code) for attribute in self._animated}
                 for attribute, value in (samples | amend(samples)).items():
-                    merged.SetTimeSample(attribute, frame, value)
+                    merged.SetTimeSample(attribute, code, value)
                 unsaved += frame_bytes
                 if unsaved > _MERGE_BYTES:
                     merged.Save()
@@ -165,29 +176,38 @@ class ChunkedLayer:
         folder = f"./{self._folder.name}"
         chunks = [*self._chunks, *new]
         root = Sdf.Layer.CreateAnonymous(".usda")
-        for key in ("defaultPrim", "metersPerUnit", "upAxis"):
-            root.pseudoRoot.SetInfo(key, self._static.pseudoRoot.GetInfo(key))
+        for key in self._static.pseudoRoot.ListInfoKeys():
+            if key not in _OWN_INFO:
+                root.pseudoRoot.SetInfo(key, self._static.pseudoRoot.GetInfo(key))
         root.subLayerPaths.append(f"{folder}/static.usdc")
+        self._go_over_base(root)
         self._describe(root, metadata)
         if chunks:
-            last = float(self.frame_count - 1)
-            times = [(0.0, 0.0), (last, last)] if last > 0.0 else [(0.0, 0.0)]
-            active = [(float(chunk.frames[0]), float(index)) for index, chunk in enumerate(chunks)]
+            first, last = self._clock.code(0), self._clock.code(self.frame_count - 1)
+            times = [(first, first), (last, last)] if last > first else [(first, first)]
+            active = [(self._clock.code(chunk.frames[0]), float(index)) for index, chunk in enumerate(chunks)]
             clips = {
-                "primPath": WORLD.pathString,
                 "manifestAssetPath": Sdf.AssetPath(f"{folder}/manifest.usdc"),
                 "assetPaths": Sdf.AssetPathArray([Sdf.AssetPath(f"{folder}/{chunk.path.name}") for chunk in chunks]),
                 "active": Vt.Vec2dArray(active),
                 "times": Vt.Vec2dArray(times),
             }
-            root.GetPrimAtPath(WORLD).SetInfo("clips", {"default": clips})
+            for prim in self._static.rootPrims:
+                own = {"default": {**clips, "primPath": prim.path.pathString}}
+                Sdf.CreatePrimInLayer(root, prim.path).SetInfo("clips", own)
         with replacing(self.path) as temporary:  # exporting would use a temporary file of its own
             temporary.write_text(root.ExportToString(), encoding="utf-8")
         trust(self.path, map(str, self._folder.glob("*.usdc")))
 
     def _describe(self, layer: Sdf.Layer, metadata: dict[str, Any]) -> None:
-        set_clock(layer, self._static.framesPerSecond, self.frame_count)
-        Sdf.CreatePrimInLayer(layer, WORLD).SetInfo("customData", metadata)
+        self._clock.author(layer, self.frame_count)
+        if metadata:
+            Sdf.CreatePrimInLayer(layer, WORLD).SetInfo("customData", metadata)
+
+    def _go_over_base(self, layer: Sdf.Layer) -> None:
+        if self._base:
+            layer.subLayerPaths.append(self._base)
+            layer.customLayerData = {**layer.customLayerData, "warpfem": {"frames": self.frame_count}}
 
     def discard(self) -> None:
         """Removes the partial file, with its folder."""

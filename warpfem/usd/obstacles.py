@@ -8,13 +8,16 @@ from typing import TypeAlias
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, Vt
 
-from warpfem.boundary import BoxWalls, Obstacle, Plane, Sphere
+from warpfem.boundary import Box, BoxWalls, Obstacle, Plane, Sphere
 from warpfem.usd.prims import OBSTACLES, WORLD, extent_of, paint_obstacle, set_topology
 
 Polygons: TypeAlias = tuple[np.ndarray, Sequence[np.ndarray] | np.ndarray]
 
 _CORNERS = 64
 """Corners of a circle: its polygon is 0.12 % of the radius too small between them."""
+
+_CUBE = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
+_SIDES = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
 
 
 def define_obstacles(stage: Usd.Stage, obstacles: Sequence[Obstacle], lower: np.ndarray, upper: np.ndarray) -> None:
@@ -62,6 +65,8 @@ def _polygons(obstacle: Obstacle, center: np.ndarray, size: float) -> Polygons:
         return _quad(obstacle, center, size) if len(obstacle.point) == 3 else _strip(obstacle, center, size)
     if isinstance(obstacle, BoxWalls):
         return _bars(obstacle) if len(obstacle.lower) == 3 else _border(obstacle, size)
+    if isinstance(obstacle, Box):
+        return _block(obstacle) if len(obstacle.center) == 3 else _tile(obstacle, size)
     return _ball(obstacle) if len(obstacle.center) == 3 else _disc(obstacle, size)
 
 
@@ -121,11 +126,24 @@ def _border(box: BoxWalls, size: float) -> Polygons:
     return _behind(np.concatenate([inner, outer]), size), faces
 
 
+def _corners(box: Box, signs: np.ndarray) -> np.ndarray:
+    return np.array(box.center) + (0.5 * signs * np.array(box.size)) @ np.array(box.axes)
+
+
+def _block(box: Box) -> Polygons:
+    sides = _SIDES if np.linalg.det(box.shape) > 0.0 else _SIDES[:, ::-1]
+    return _corners(box, 2 * _CUBE - 1), sides
+
+
+def _tile(box: Box, size: float) -> Polygons:
+    around = np.array([[0, 1, 2, 3]])
+    corners = _corners(box, np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]))
+    return _behind(corners, size), around if np.linalg.det(box.shape) > 0.0 else around[:, ::-1]
+
+
 def _bars(box: BoxWalls) -> Polygons:
     lower, upper = np.array(box.lower), np.array(box.upper)
     thickness = 0.01 * (upper - lower).max()
-    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
-    sides = np.array([(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
     points: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     for axis in range(3):
@@ -134,6 +152,6 @@ def _bars(box: BoxWalls) -> Polygons:
             start = np.where(at_upper, upper, lower - thickness)
             stop = np.where(at_upper, upper + thickness, lower)
             start[axis], stop[axis] = lower[axis], upper[axis]
-            faces.append(sides + 8 * len(points))
-            points.append(start + corners * (stop - start))
+            faces.append(_SIDES + 8 * len(points))
+            points.append(start + _CUBE * (stop - start))
     return np.concatenate(points), np.concatenate(faces)

@@ -23,6 +23,7 @@ from warpfem.usd.colors import ColorQuantity, ColorScale
 WORLD = Sdf.Path("/World")
 TETS, OBSTACLES = "simulation", "Obstacles"
 LOOKS = WORLD.AppendChild("Looks")
+PHYSICS = WORLD.AppendChild("Physics")
 POINT_PRIMVARS: dict[ColorQuantity, str] = {"von_mises": "vonMisesPoint", "jacobian": "JPoint"}
 CELL_PRIMVARS: dict[ColorQuantity, str] = {"von_mises": "vonMises", "jacobian": "J"}
 
@@ -32,8 +33,8 @@ _FAR = 16.0
 
 
 def prim_names(names: Iterable[str]) -> list[str]:
-    """Valid prim names, unique among themselves and apart from ``Looks`` and ``Obstacles``."""
-    taken, result = {LOOKS.name, OBSTACLES}, []
+    """Valid prim names, unique among themselves and apart from those of warpfem's own prims."""
+    taken, result = {LOOKS.name, PHYSICS.name, OBSTACLES}, []
     for name in names:
         stem = Tf.MakeValidIdentifier(name or "body")
         unique, count = stem, 1
@@ -45,15 +46,14 @@ def prim_names(names: Iterable[str]) -> list[str]:
     return result
 
 
-def define_world(stage: Usd.Stage, fps: float, up_axis: str, comment: str) -> None:
-    """Authors the default prim, the stage's units and clock, and the materials."""
+def define_world(stage: Usd.Stage, up_axis: str, comment: str) -> None:
+    """Authors the default prim, the stage's units, and the materials."""
     world = UsdGeom.Xform.Define(stage, WORLD).GetPrim()
     Usd.ModelAPI(world).SetKind(Kind.Tokens.component)
     stage.SetDefaultPrim(world)
     UsdGeom.SetStageUpAxis(stage, up_axis)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.GetRootLayer().comment = comment
-    set_clock(stage.GetRootLayer(), fps, 0)
 
     UsdGeom.Scope.Define(stage, LOOKS)
     color = _material(stage, "Body").CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
@@ -64,12 +64,6 @@ def define_world(stage: Usd.Stage, fps: float, up_axis: str, comment: str) -> No
     color.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float3))
     grey = _material(stage, "Obstacle").CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     grey.Set(Gf.Vec3f(_OBSTACLE_GREY))
-
-
-def set_clock(layer: Sdf.Layer, fps: float, frame_count: int) -> None:
-    """Authors the frame rate and the time codes 0..frame_count - 1."""
-    layer.timeCodesPerSecond = layer.framesPerSecond = fps
-    layer.startTimeCode, layer.endTimeCode = 0.0, float(max(frame_count - 1, 0))
 
 
 def paint_obstacle(prim: UsdGeom.Gprim) -> None:
@@ -199,6 +193,11 @@ class BodyPrims:
                 result |= _primvar(self._tets, CELL_PRIMVARS[quantity], cells[quantity])
                 result |= _primvar(self._tets, POINT_PRIMVARS[quantity], averages[quantity])
         return result
+
+    @property
+    def simulation(self) -> Sdf.Path | None:
+        """The ``TetMesh``, if there is one."""
+        return self._tets
 
     def surface_attribute(self, quantity: ColorQuantity) -> Sdf.Path:
         """The attribute of the point values on the surface."""

@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
@@ -76,13 +76,21 @@ def at_rest(attribute: Usd.Attribute) -> Any:
     return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
 
 
-def world_matrix(prim: Usd.Prim) -> np.ndarray:
-    """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres.
+def stated_up_axis(stage: Usd.Stage) -> Literal["Y", "Z"] | None:
+    """The axis that points up, if the file states it."""
+    if not stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis):
+        return None
+    return "Z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "Y"
 
-    The stage's unit counts where the file states one; where it does not, numbers are metres.
-    """
-    stage = prim.GetStage()
+
+def metres_per_unit(stage: Usd.Stage) -> float:
+    """The stage's unit of length [m]; where the file states none, numbers are metres."""
     stated = stage.HasAuthoredMetadata(UsdGeom.Tokens.metersPerUnit)
+    return UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
+
+
+def world_matrix(prim: Usd.Prim) -> np.ndarray:
+    """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres."""
     matrix = np.array(UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim))
-    matrix[:, :3] *= UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
+    matrix[:, :3] *= metres_per_unit(prim.GetStage())
     return matrix

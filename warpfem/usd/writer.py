@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -16,22 +12,19 @@ from pxr import Gf, Sdf, Usd
 
 from warpfem.boundary import Obstacle
 from warpfem.errors import OutputError
-from warpfem.files import beside
 from warpfem.usd.bodies import BodyFrame, UsdBody, in_space
 from warpfem.usd.chunks import ChunkedLayer, Samples
+from warpfem.usd.clock import Clock
 from warpfem.usd.colors import ColorQuantity, ColorScale, spread_of
+from warpfem.usd.frames import FrameWriter, check_path
 from warpfem.usd.obstacles import define_obstacles
+from warpfem.usd.physics.author import ScenePhysics, author_physics
 from warpfem.usd.prims import POINT_PRIMVARS, BodyPrims, define_world, prim_names
 from warpfem.usd.saved import Chunk, partial_path, saved_chunks
-from warpfem.usd.stages import reporting, trust
-
-SUFFIXES = (".usdc", ".usd", ".usda")
-
-_TEXT_RATIO = 3.5
-"""Bytes of a number as text over those of a float32."""
+from warpfem.usd.stages import reporting
 
 
-class UsdWriter:
+class UsdWriter(FrameWriter):
     """Stores an animation of elastic bodies as one USD file.
 
     While the run goes, the frames are in ``<stem>.partial.usda`` (with the folder ``<stem>.partial`` beside
@@ -47,10 +40,13 @@ class UsdWriter:
     ``vonMisesPoint`` and ``JPoint`` per point (averages weighted by rest volume). ``displayColor`` shows
     one of the latter; the custom data of ``/World`` says which, and the range of its colours. Points are
     float32; those of a body that is far from the origin for its size are relative to a double-precision
-    translation of its Xform.
+    translation of its Xform. ``/World/Physics`` says what was simulated, as far as UsdPhysics and the proposal for
+    deformable bodies have words for it.
 
     Used as a context manager it closes also when the block raises, so that all finished frames are kept.
     """
+
+    _bodies: Sequence[BodyPrims]
 
     def __init__(
         self,
@@ -60,9 +56,11 @@ class UsdWriter:
         fps: float,
         up_axis: Literal["Y", "Z"] = "Y",
         obstacles: Sequence[Obstacle] = (),
+        physics: ScenePhysics | None = None,
         color_by: ColorQuantity = "von_mises",
         color_range: tuple[float, float] | None = None,
         frames_per_chunk: int = 8,
+        equilibria: bool = False,
         comment: str = "",
         keep: tuple[int, Sequence[BodyFrame]] | None = None,
         expected_frames: int = 0,
@@ -75,10 +73,12 @@ class UsdWriter:
             fps: frames per second, > 0: frame i is at i / fps seconds.
             up_axis: the axis that viewers show as up.
             obstacles: drawn as fixed prims.
+            physics: what the file says of the scene, for other simulators and to be read as a stage; not in 2D.
             color_by: the quantity that ``displayColor`` shows.
             color_range: values of the first and last colour; ``None``: 0..s for von Mises, 1 - s..1 + s for
                 J, with s such that at most 0.5 % of a body's surface points are beyond in any frame.
             frames_per_chunk: the most frames that wait in memory to be saved.
+            equilibria: frames are equilibria on the way to the full load, and not moments in time.
             comment: stored in the file as its comment.
             keep: the last of the frames to keep that an earlier writer of the same ``path`` left, in its
                 partial file or in ``path`` itself: its index, and what it holds, to know it by. Later frames
@@ -92,13 +92,13 @@ class UsdWriter:
         self.path = Path(path)
         _check_settings(self.path, bodies, fps, up_axis, color_by, color_range, frames_per_chunk)
         self._quantity: ColorQuantity = color_by
+        self._equilibria = equilibria
         self._fixed_range = color_range
         self._spread = 0.0
-        self._closed = False
         with reporting(f"{self.path} cannot be written", OutputError):
             static = Sdf.Layer.CreateAnonymous(".usdc")
             stage = Usd.Stage.Open(static)
-            define_world(stage, fps, up_axis, comment)
+            define_world(stage, up_axis, comment)
             names = prim_names(body.name for body in bodies)
             self._bodies = [BodyPrims(stage, name, body) for name, body in zip(names, bodies, strict=True)]
             points = np.concatenate([in_space(body.rest_points) for body in bodies])
@@ -106,75 +106,12 @@ class UsdWriter:
             rest = self._samples([body.rest for body in self._bodies], "the rest shape")
             for attribute, value in rest.items():
                 stage.GetAttributeAtPath(attribute).Set(value)
+            meshes = [body.simulation for body in self._bodies if body.simulation is not None]
+            if physics is not None and meshes:
+                author_physics(stage, physics, meshes, obstacles)
             kept = [] if keep is None else self._find_kept(*keep)
             self._check_room(rest, expected_frames)
-            self._layer = ChunkedLayer(self.path, static, rest, frames_per_chunk, self._metadata(), kept)
-
-    def write_frame(self, frames: Sequence[BodyFrame]) -> None:
-        """Adds the next frame.
-
-        Args:
-            frames: one per body, in the order of the bodies; the arrays are copied.
-
-        Raises:
-            OutputError: another number of bodies, wrong shapes, values that are not finite (the frame is left
-                out, those before it stay), a closed writer, or a disk that takes no more.
-        """
-        if self._closed:
-            raise OutputError(f"{self.path} is closed: frames cannot be added")
-        where = f"frame {self._layer.frame_count}"
-        if len(frames) != len(self._bodies):
-            raise OutputError(f"{where}: {len(frames)} bodies given, the file has {len(self._bodies)}")
-        for body, frame in zip(self._bodies, frames, strict=True):
-            body.check(frame, where)
-        with self._saving():
-            self._layer.append(self._samples(frames, where), self._metadata())
-
-    def flush(self) -> None:
-        """Saves the frames that still wait in memory.
-
-        Raises:
-            OutputError: the disk takes no more.
-        """
-        with self._saving():
-            self._layer.flush(self._metadata())
-
-    def close(self) -> Path:
-        """Merges the frames into the output file and removes the partial one; a second call does nothing.
-
-        Returns:
-            The path of the output file.
-
-        Raises:
-            OutputError: the file cannot be written; the partial one stays.
-        """
-        if not self._closed:
-            with self._saving():
-                self._layer.merge(self._metadata(), self._colors)
-            trust(self.path)
-            self._closed = True
-        return self.path
-
-    def __enter__(self) -> UsdWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            if error is not None and self._layer.frame_count == 0:  # an older file is worth more than an empty one
-                self._layer.discard()
-                self._closed = True
-            self.close()
-        except OutputError as output_error:
-            if error is None or kind is GeneratorExit:  # which nobody gets to see
-                raise
-            if str(error) != str(output_error):
-                error.add_note(str(output_error))
-
-    def _saving(self) -> contextlib.AbstractContextManager[None]:
-        saved = f"what was saved of its frames is in {self._layer.path}"
-        return reporting(f"{self.path} cannot be written ({saved})", OutputError)
+            self._layer = ChunkedLayer(self.path, static, rest, Clock(fps), frames_per_chunk, self._metadata(), kept)
 
     def _find_kept(self, last: int, frames: Sequence[BodyFrame]) -> list[Chunk]:
         """The chunks with the frames up to ``last``, which must be equal to ``frames``; minds their colours."""
@@ -200,20 +137,6 @@ class UsdWriter:
             return chunks
         raise OutputError(f"{self.path}: the frames up to {last} are missing: {'; '.join(reasons)}. Run it anew")
 
-    def _check_room(self, rest: Samples, frame_count: int) -> None:
-        """The partial file and the merged one are on the disk together at the end."""
-        folder = _existing_folder(self.path)
-        frame_bytes = sum(np.asarray(value).nbytes for value in rest.values())
-        old = [path for path in beside(self.path, "partial").glob("*") if path.is_file()]
-        free = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in old)
-        copies = 2.0 + (_TEXT_RATIO if self.path.suffix == ".usda" else 0.0)
-        needed = copies * frame_count * frame_bytes
-        if needed > free:
-            raise OutputError(
-                f"{self.path} has no room: its {frame_count} frames need {_size(needed)} while they are merged at the "
-                f"end, and {folder} has {_size(free)} free: take another folder, fewer frames or a coarser mesh"
-            )
-
     @property
     def _scale(self) -> ColorScale:
         if self._fixed_range is not None:
@@ -223,7 +146,8 @@ class UsdWriter:
     def _metadata(self) -> dict[str, Any]:
         scale = self._scale
         primvar, limits = POINT_PRIMVARS[scale.quantity], Gf.Vec2d(scale.lower, scale.upper)
-        return {"warpfem": {"colorBy": scale.quantity, "colorPrimvar": primvar, "colorRange": limits}}
+        stated = {"colorBy": scale.quantity, "colorPrimvar": primvar, "colorRange": limits}
+        return {"warpfem": stated | ({"equilibria": True} if self._equilibria else {})}
 
     def _samples(self, frames: Sequence[BodyFrame], where: str) -> Samples:
         samples: Samples = {}
@@ -236,62 +160,14 @@ class UsdWriter:
         """Widens the range of the colours to what the bodies' surfaces show."""
         self._spread = max(self._spread, *(spread_of(self._quantity, np.asarray(values)) for values in surfaces))
 
+    def _amended(self, samples: Samples) -> Samples:
+        return self._colors(samples)
+
     def _colors(self, samples: Samples) -> Samples:
         colors: Samples = {}
         for body in self._bodies:
             colors |= body.colors(samples, self._scale)
         return colors
-
-
-def check_path(path: str | Path) -> None:
-    """Checks what can be told of an output without writing anything.
-
-    Raises:
-        OutputError: a name without one of ``SUFFIXES``, or one that USD cannot bear; a folder, a file that is
-            write-protected, or a place that cannot be written to.
-    """
-    path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise OutputError(f"{str(path)!r}: the name of the output must end in {', '.join(SUFFIXES)}")
-    odd = _odd_part(path)
-    if odd:
-        raise OutputError(f"{str(path)!r} cannot be written: USD does not bear {odd} in the name of a file")
-    with reporting(f"{path} cannot be written", OutputError):
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            beside(path, "writing.checkpoint.npz").stat()  # as long as the longest name beside it
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder: give the name of a file")
-        if path.exists() and not os.access(path, os.W_OK):
-            raise OutputError(f"{path} cannot be written: it is write-protected")
-        folder = _existing_folder(path)
-        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-            raise OutputError(f"{path} cannot be written: {folder} is not a folder that can be written to")
-
-
-def _odd_part(path: Path) -> str:
-    """What USD's references to files do not bear in a path, or ""."""
-    whole = path.absolute().as_posix()
-    try:
-        whole.encode()
-    except UnicodeEncodeError:
-        return "bytes that are not UTF-8"
-    odd = [text for text in ("\0", "\\", ":SDF_FORMAT_ARGS:") if text in whole]
-    odd += [character for character in path.name if ord(character) < 32 or ord(character) == 127]
-    return repr(odd[0]) if odd else ""
-
-
-def _existing_folder(path: Path) -> Path:
-    """The folder of a path, or the one that it will be made in."""
-    folder = path.absolute().parent
-    while not folder.exists():
-        folder = folder.parent
-    return folder
-
-
-def _size(byte_count: float) -> str:
-    """Bytes as a person reads them."""
-    unit, name = (1e9, "GB") if byte_count >= 1e9 else (1e6, "MB")
-    return f"{byte_count / unit:.3g} {name}"
 
 
 def _check_settings(

@@ -1,0 +1,1 @@
+"""Neighbours: solids of other simulators stepped by warpfem. Each module needs the package that it is named after."""
