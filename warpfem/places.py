@@ -111,13 +111,13 @@ def _near(lower: np.ndarray, upper: np.ndarray, places: np.ndarray) -> Iterator[
     for axis, span in enumerate(spans[owners].T):
         boxes[:, axis] = first[owners, axis] + within % span
         within = within // span
-    keys = np.ravel_multi_index(tuple(boxes.T), tuple(shape))
+    keys = np.asarray(np.ravel_multi_index(tuple(boxes.T), tuple(shape)))
     order = np.argsort(keys, kind="stable")
     keys, owners = keys[order], owners[order]
 
     at = np.floor((places - origin) / width).astype(np.int64)
     inside = np.flatnonzero(((at >= 0) & (at < shape)).all(axis=1))
-    own = np.ravel_multi_index(tuple(at[inside].T), tuple(shape))
+    own = np.asarray(np.ravel_multi_index(tuple(at[inside].T), tuple(shape)))
     begins = np.searchsorted(keys, own, side="left")
     counts = np.searchsorted(keys, own, side="right") - begins
     portions = np.cumsum(counts) // PAIRS_AT_ONCE
