@@ -522,6 +522,7 @@ def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, ca
     assert "The cheapest setting within 10 % of the motion (L2) is" in printed
     data = json.loads((out / "trade.json").read_text())
     assert len(data["settings"]) == 8
+    assert [machine["cores"] for machine in data["ran_on"]] == [data["machine"]["cores"]]
     edge = [record for record in data["settings"] if record["on_front"]]
     most = max(edge, key=lambda record: record["errors"]["l2"])
     parts = {kind: errors["l2"] for kind, errors in most["parts"].items()}
