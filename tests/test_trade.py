@@ -503,6 +503,18 @@ def test_nothing_is_measured_where_nothing_moves(bar, tmp_path, in_process):
         build_reference(own, mesh_control(own.problem), own.run([Setting()]))
 
 
+def test_a_quantity_without_a_value_is_told_of_with_its_reason(bar, tmp_path, monkeypatch):
+    def without(order: Order) -> Outcome:
+        outcome = fake(order)
+        outcome.missing = {"tip": "it does not swing"}
+        return outcome
+
+    monkeypatch.setattr("warpfem.trade.study.run_order", without)
+    own = study(bar, tmp_path, Here())
+    with pytest.raises(SimulationError, match="the reference has no value of 'tip': it does not swing"):
+        build_reference(own, mesh_control(own.problem), own.run([Setting()]), "tip")
+
+
 def test_errors_are_not_relative_to_nothing(bar, tmp_path, in_process):
     bar.write_text(BAR.replace('{"tip": tip}', '{"nothing": lambda motion: 0.0}'))
     own = study(bar, tmp_path / "a", Here())

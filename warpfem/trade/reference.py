@@ -136,7 +136,9 @@ class _Builder:
             reference, cross = self._reference()
             parts = reference.parts.get(name)
             if parts is None:
-                raise SimulationError(f"the reference has no value of '{name}': it has {', '.join(reference.names)}")
+                runs = [point.first for point in self.study.solve(self._settings())]
+                why = next((run.missing[name] for run in runs if name in run.missing), "")
+                raise SimulationError(f"the reference has no value of '{name}'" + (f": {why}" if why else ""))
             if not reference.scales[name] > 0.0:
                 raise SimulationError(f"the reference has 0 for '{name}': no error is relative to that")
             best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
