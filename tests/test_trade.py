@@ -515,6 +515,22 @@ def test_a_quantity_without_a_value_is_told_of_with_its_reason(bar, tmp_path, mo
         build_reference(own, mesh_control(own.problem), own.run([Setting()]), "tip")
 
 
+@pytest.mark.parametrize(
+    ("size", "limit", "remark"),
+    [(1.0, 600.0, "its meshes do not get finer"), (None, 0.1, "a finer mesh would take more than 0.1 s")],
+)
+def test_why_a_reference_is_no_finer(bar, tmp_path, monkeypatch, size, limit, remark):
+    def alike(order: Order) -> Outcome:
+        outcome = fake(order)
+        outcome.mesh_size = size or outcome.mesh_size
+        return outcome
+
+    monkeypatch.setattr("warpfem.trade.study.run_order", alike)
+    own = study(bar, tmp_path, Here(), limit=limit)
+    (found,) = build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)])).remarks
+    assert remark in found
+
+
 def test_errors_are_not_relative_to_nothing(bar, tmp_path, in_process):
     bar.write_text(BAR.replace('{"tip": tip}', '{"nothing": lambda motion: 0.0}'))
     own = study(bar, tmp_path / "a", Here())
