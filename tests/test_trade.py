@@ -422,6 +422,7 @@ def test_failures_are_results(bar, tmp_path):
     """A crash, a hang, an end, a scene that is no scene, and steps that are too long."""
     actions = {
         "die": "import os; os.kill(os.getpid(), 9)",
+        "stop": "import os; os.kill(os.getpid(), 15)",
         "hang": "import time; time.sleep(60)",
         "end": "import os; os._exit(3)",
         "raise": "1 / 0",
@@ -436,13 +437,14 @@ def test_failures_are_results(bar, tmp_path):
         by_chance |= {setting.label} if outcome.by_chance else set()
     for name, reason in {
         "kind=die": "killed by SIGKILL",
+        "kind=stop": "killed by SIGTERM",
         "kind=hang": "out of time: more than 5 s",
         "kind=end": "ended with status 3",
         "kind=raise": "ZeroDivisionError",
         "solver=velocity_verlet E=10000000.0": "above the stability limit",
     }.items():
         assert reason in reasons[name]
-    assert by_chance == {"kind=die"}  # the others would fail again
+    assert by_chance == {"kind=die", "kind=stop"}  # the others would fail again
 
 
 def test_only_failures_that_may_go_away_are_run_again(bar, tmp_path, monkeypatch):
