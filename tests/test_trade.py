@@ -200,6 +200,9 @@ def test_orders_have_bounds():
     assert observed_order(1e9, [1.0, 0.5, 0.25]) == MOST_ORDER
     assert extrapolate([np.ones(1), np.ones(1) * 1.5], [1.0, 0.5]).band == 0.5
     assert "rounding" in extrapolate([np.zeros(1), np.ones(1), np.ones(1)], [1.0, 0.5, 0.2]).remark
+    same = extrapolate([np.ones(1), np.ones(1) * 1.5, np.ones(1) * 1.75], [0.5, 0.5, 0.25])
+    assert (same.order, same.band) == (None, 0.25)
+    assert "do not get finer" in same.remark
 
 
 # ---- fronts
