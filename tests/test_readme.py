@@ -42,7 +42,7 @@ def test_python_blocks_run(tmp_path, monkeypatch, capsys):
 def test_commands_are_those_of_the_parser():
     blocks = README.split("```")[1::2]
     lines = [line for block in blocks for line in block.splitlines() if line.startswith("warpfem ")]
-    assert len(lines) == 15
+    assert len(lines) == 16
     for line in lines:
         parser().parse_args(line.split("#")[0].split()[1:])
 
