@@ -417,6 +417,10 @@ def Xform "{name}" (instanceable = true, references = @./part.usda@</Part>)
             ["/Frozen: is not simulated: physics:kinematicEnabled is true"],
         ),
         (
+            tets("Asleep", more="bool physics:startsAsleep = true"),
+            ["/Asleep: physics:startsAsleep is left out: it moves from the start"],
+        ),
+        (
             tets("Off", more="bool physics:bodyEnabled = false"),
             ["/Off: is not simulated: physics:bodyEnabled is false"],
         ),
@@ -455,6 +459,13 @@ def test_bodies_without_a_collider_touch_obstacles_all_the_same(tmp_path: Path) 
     ground = 'def Plane "Ground" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}'
     path = write(tmp_path / "stage.usda", SCENE, tets(apis=f'"{SIMULATION}"'), MATERIAL, ground)
     assert remarks(path) == ["/sim: has no collider, but touches the obstacles all the same"]
+
+
+def test_the_friction_of_a_body_is_not_that_of_the_obstacle(tmp_path: Path) -> None:
+    ground = 'def Plane "Ground" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}'
+    rough = MATERIAL.replace("float physics:density", "float physics:staticFriction = 0.5\n    float physics:density")
+    found = remarks(write(tmp_path / "stage.usda", SCENE, tets(), rough, ground))
+    assert found == ["/sim: the friction of /Rubber is left out: that of the obstacles counts"]
 
 
 def test_a_stage_without_a_scene_has_the_gravity_of_the_earth(tmp_path: Path) -> None:

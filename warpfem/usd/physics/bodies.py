@@ -94,6 +94,8 @@ def _body(view: StageView, prim: Usd.Prim, owner: Usd.Prim, name: str, pins: np.
     corners = rest_points[own_cells.reshape(-1, 4)]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
     youngs_modulus, poissons_ratio, density, model = _materials(view, prim, len(cells))
+    if view.switch(owner, "physics:startsAsleep", False):
+        view.warn(prim, "physics:startsAsleep is left out: it moves from the start")
     lacking = view.value(owner, tokens.NOT_HERE)
     if lacking:
         view.warn(prim, f"the scene that it comes from had {lacking}, which a stage has no words for: it runs without")

@@ -11,6 +11,8 @@ from warpfem.boundary import Box, Obstacle, Plane, Sphere
 from warpfem.usd.physics import tokens
 from warpfem.usd.physics.view import StageView
 
+FRICTION = ("physics:dynamicFriction", "physics:staticFriction")
+
 _ROUNDING = 1e-5
 """How far a transform may be from one without shear, relative to its size."""
 
@@ -84,8 +86,7 @@ def _friction(view: StageView, prim: Usd.Prim) -> float:
     material = view.material(prim)
     if material is None:
         return 0.0
-    dynamic = view.number(material, "physics:dynamicFriction")
-    static = view.number(material, "physics:staticFriction")
+    dynamic, static = (view.number(material, name) for name in FRICTION)
     if dynamic is not None and static is not None and static != dynamic:
         view.warn(material, f"static friction {static:g} is not told from the dynamic one, {dynamic:g}, which is taken")
     if view.number(material, "physics:restitution"):
