@@ -421,6 +421,11 @@ def Xform "{name}" (instanceable = true, references = @./part.usda@</Part>)
             ["/Asleep: physics:startsAsleep is left out: it moves from the start"],
         ),
         (
+            f'def PointInstancer "Many" {{\n{tets("Seed")}\n'
+            'def Plane "Floor" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}\n}',
+            ["/Many/Seed: is not simulated: it is a proto", "/Many/Floor: is no obstacle: it is a prototype"],
+        ),
+        (
             tets("Off", more="bool physics:bodyEnabled = false"),
             ["/Off: is not simulated: physics:bodyEnabled is false"],
         ),
@@ -466,6 +471,20 @@ def test_the_friction_of_a_body_is_not_that_of_the_obstacle(tmp_path: Path) -> N
     rough = MATERIAL.replace("float physics:density", "float physics:staticFriction = 0.5\n    float physics:density")
     found = remarks(write(tmp_path / "stage.usda", SCENE, tets(), rough, ground))
     assert found == ["/sim: the friction of /Rubber is left out: that of the obstacles counts"]
+
+
+def test_without_units_numbers_are_metres(tmp_path: Path) -> None:
+    path = write(tmp_path / "stage.usda", SCENE, tets(), MATERIAL, head='upAxis = "Y"')
+    assert remarks(path) == ["it states no metersPerUnit: its numbers are taken as metres"]
+
+
+def test_a_body_may_be_higher_up(tmp_path: Path) -> None:
+    inner = f'def Xform "Parts" {{\n{tets()}\n}}'
+    body = (
+        f'def Xform "Toy" (prepend apiSchemas = ["PhysicsDeformableBodyAPI"]) {{\nfloat physics:mass = 40\n{inner}\n}}'
+    )
+    (own,) = read(write(tmp_path / "stage.usda", SCENE, body, MATERIAL)).bodies
+    assert (own.name, own.density) == ("Toy", pytest.approx(40.0))
 
 
 def test_a_stage_without_a_scene_has_the_gravity_of_the_earth(tmp_path: Path) -> None:

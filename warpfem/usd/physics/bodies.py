@@ -39,10 +39,15 @@ def read_bodies(view: StageView, pins: dict[str, np.ndarray]) -> tuple[StageBody
 
 
 def body_prim(prim: Usd.Prim) -> Usd.Prim:
-    """The prim that governs a simulation mesh: the mesh itself, or its parent if that one is the deformable body."""
-    parent = prim.GetParent()
-    if tokens.BODY_API not in applied(prim) and tokens.BODY_API in applied(parent):
-        return parent
+    """The prim that governs a simulation mesh: the nearest deformable body above, or the mesh itself if there is none.
+
+    The proposal wants it on the mesh or its parent; one that is higher up can mean nothing else.
+    """
+    above = prim
+    while above and not above.IsPseudoRoot() and not above.HasAPI(UsdPhysics.RigidBodyAPI):
+        if tokens.BODY_API in applied(above):
+            return above
+        above = above.GetParent()
     return prim
 
 
@@ -57,6 +62,8 @@ def _unique(name: str, taken: set[str]) -> str:
 def _reason_to_skip(view: StageView, prim: Usd.Prim, owner: Usd.Prim, owners: set[str]) -> str:
     if not prim.IsA(UsdGeom.TetMesh):
         return f"a volume deformable must be a TetMesh, not a {prim.GetTypeName() or 'prim without a type'}"
+    if view.is_prototype(prim):
+        return "it is a prototype of a PointInstancer"
     if str(owner.GetPath()) in owners:
         return f"{owner.GetPath()} has another simulation mesh"
     if owner.HasAPI(UsdPhysics.RigidBodyAPI):

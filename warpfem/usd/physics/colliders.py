@@ -52,6 +52,8 @@ def is_free(view: StageView, body: Usd.Prim) -> bool:
 
 
 def _reason_to_skip(view: StageView, prim: Usd.Prim) -> str:
+    if view.is_prototype(prim):
+        return "it is a prototype of a PointInstancer"
     above = prim
     while above and not above.IsPseudoRoot():
         if above.HasAPI(UsdPhysics.RigidBodyAPI):
