@@ -3,13 +3,15 @@
 # make slow   the long checks too
 # make verify the verification suite, which writes docs/accuracy.md
 # make bench  the benchmarks beside other codes, which write docs/performance.md
+# make docs   the documentation, in docs/_build
+# make gallery the pictures of the documentation, from the shipped scenes
 # make lint   style and types
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow verify bench lint clean
+.PHONY: demo test slow verify bench docs gallery lint clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -42,6 +44,14 @@ bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench,plot,solvers]'
 	$(BIN)/python benchmarks/performance --install --peers .peers --out docs/performance.md
 
+docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build
+	@echo "The documentation: $(CURDIR)/docs/_build/index.html"
+
+gallery: $(VENV)/extras
+	$(BIN)/python docs/gallery.py
+
 lint: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	$(BIN)/ruff check .
@@ -49,4 +59,4 @@ lint: $(VENV)/installed
 	$(BIN)/mypy warpfem
 
 clean:
-	rm -rf $(VENV) .peers output
+	rm -rf $(VENV) .peers output docs/_build

@@ -24,7 +24,7 @@ def mooney_rivlin(F: wp.mat33d, parameters: Any):
     J = wp.determinant(F)
     I1 = wp.trace(C)
     I2 = (I1 * I1 - wp.ddot(C, C)) / wp.float64(2.0)
-    inverse_cube_root = wp.pow(J, wp.float64(-1.0 / 3.0))
+    inverse_cube_root = wp.pow(J, wp.float64(-1.0) / wp.float64(3.0))  # of 1.0 / 3.0 Warp keeps 8 digits
     scale = inverse_cube_root * inverse_cube_root  # J^-2/3
     three = wp.float64(3.0)
     volumetric = K / wp.float64(2.0) * (J - wp.float64(1.0)) * (J - wp.float64(1.0))

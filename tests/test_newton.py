@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import warp as wp
-from test_readme import python_blocks
 
 import warpfem as wf
 
@@ -314,10 +313,3 @@ def test_steps_are_not_captured():
     solver, state = SolverWarpfem(model), model.state()
     with pytest.raises(wf.SimulationError, match="cannot be captured"), wp.ScopedCapture("cpu"):
         solver.step(state, state, None, None, 0.01)
-
-
-def test_the_example_of_the_readme_runs(capsys):
-    (block,) = [block for block in python_blocks() if "import newton" in block]
-    exec(compile(block, "README.md", "exec"), {"wf": wf})
-    lowest, residual = map(float, capsys.readouterr().out.split())
-    assert 0.8 < lowest < 0.999 and residual < 1e-3

@@ -121,7 +121,7 @@ def _near(lower: np.ndarray, upper: np.ndarray, places: np.ndarray) -> Iterator[
 
     at = np.floor((places - origin) / width).astype(np.int64)
     inside = np.flatnonzero(((at >= 0) & (at < extent)).all(axis=1))
-    own = np.ravel_multi_index(tuple(at[inside].T), tuple(extent))
+    own = np.asarray(np.ravel_multi_index(tuple(at[inside].T), tuple(extent)))
     begins = np.searchsorted(keys, own, side="left")
     counts = np.searchsorted(keys, own, side="right") - begins
     portions = np.cumsum(counts) // PAIRS_AT_ONCE

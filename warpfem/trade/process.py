@@ -11,12 +11,14 @@ import sys
 import tempfile
 import threading
 
-from warpfem.trade.machine import facts
 from warpfem.trade.outcome import Order, Outcome
 from warpfem.trade.worker import LENGTH
 
 ATTEMPTS = 2
 """How often an order is run whose process is killed: once may be by chance."""
+
+KILLS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")
+"""Signals by which others end a process; by the rest it ends itself."""
 
 _running: set[subprocess.Popen[bytes]] = set()
 _ended: set[subprocess.Popen[bytes]] = set()
@@ -55,7 +57,7 @@ def _attempt(order: Order) -> tuple[Outcome, bool]:
             )
         except OSError as problem:
             why = f"no process could be started: {problem}"
-            return Outcome(why, order.load, by_chance=True, machine=facts()), False
+            return Outcome(why, order.load, by_chance=True), False
         _running.add(process)
         late = threading.Event()
 
@@ -90,8 +92,9 @@ def _attempt(order: Order) -> tuple[Outcome, bool]:
         told = errors.read().decode(errors="replace").strip().splitlines()
     if late.is_set():
         why = f"out of time: more than {order.seconds:.0f} s"
-        return Outcome(why, order.load, limit=order.seconds, machine=facts()), False
-    killed = status == -signal.SIGKILL
-    why = f"was killed by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
-    hint = " (out of memory?)" if killed else f": {told[-1]}" if told else ""
-    return Outcome(f"the process {why}{hint}", order.load, by_chance=killed, machine=facts()), killed and not ended
+        return Outcome(why, order.load, limit=order.seconds), False
+    name = signal.Signals(-status).name if status < 0 else ""
+    killed = name in KILLS
+    why = f"was killed by {name}" if name else f"ended with status {status}"
+    hint = " (out of memory?)" if name == "SIGKILL" else f": {told[-1]}" if told else ""
+    return Outcome(f"the process {why}{hint}", order.load, by_chance=killed), killed and not ended

@@ -105,7 +105,7 @@ def build_reference(
         explicit: whether its runs take explicit steps; ``None`` as the scene does.
 
     Raises:
-        SimulationError: no ladder of two levels could be run, or the quantity has no value.
+        SimulationError: no ladder of two levels could be run, or the quantity has no value, or that of 0.
     """
     if explicit is None:
         explicit = not isinstance(study.scene.solver, ImplicitSolver)
@@ -136,7 +136,11 @@ class _Builder:
             reference, cross = self._reference()
             parts = reference.parts.get(name)
             if parts is None:
-                raise SimulationError(f"the reference has no value of '{name}': it has {', '.join(reference.names)}")
+                runs = [point.first for point in self.study.solve(self._settings())]
+                why = next((run.missing[name] for run in runs if name in run.missing), "")
+                raise SimulationError(f"the reference has no value of '{name}'" + (f": {why}" if why else ""))
+            if not reference.scales[name] > 0.0:
+                raise SimulationError(f"the reference has 0 for '{name}': no error is relative to that")
             best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
             need = max(best, least) / MARGIN if within is None else within
             growths = {"space": self._grow_mesh}
@@ -171,11 +175,15 @@ class _Builder:
             raise SimulationError("there is no reference: " + "; ".join(self.remarks))
 
     def _first_steps(self) -> list[int]:
-        """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh."""
+        """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh.
+
+        They are as short as those of the implicit settings: explicit ones are shorter than their errors in time want.
+        """
         if not self.implicit:
             return [0]
         interval = 1.0 / self.study.scene.fps
-        shortest = min((p.first.shortest_dt for p in self.asked if p.first.shortest_dt > 0.0), default=interval)
+        implicit = [point.first for point in self.asked if point.first.newton_iterations > 0]
+        shortest = min((outcome.longest_dt for outcome in implicit), default=interval)
         most = max(4, 2 ** math.ceil(math.log2(max(1.0, interval / shortest) - 1e-6)))
         return [most // 4, most // 2, most]
 
@@ -213,9 +221,13 @@ class _Builder:
             self.remarks.append(f"{MOST_LEVELS} meshes are not enough")
             return False
         last = self.study.solve(self._space()[-1:])[0].first
+        why = "its meshes do not get finer"
         for factor in (2.0, 1.5):
             finer = self.mesh.finer(self.meshes[-1], factor)
-            if finer is None or not self._affordable(factor ** (self.study.scene.dim + 1) * last.seconds[0]):
+            if not self._affordable(factor ** (self.study.scene.dim + 1) * last.seconds[0]):
+                why = f"a reference with a finer mesh would take more than {self.study.limit:g} s"
+                continue
+            if finer is None:
                 continue
             (point,) = self.study.solve([self._timed(finer, self.steps[self.shared])])
             if point.failure:
@@ -224,7 +236,7 @@ class _Builder:
             if point.first.mesh_size < LEAST_CHANGE * last.mesh_size:
                 self.meshes.append(finer)
                 return True
-        self.remarks.append(f"a reference with a finer mesh would take more than {self.study.limit:g} s")
+        self.remarks.append(why)
         return False
 
     def _grow_steps(self) -> bool:

@@ -107,11 +107,12 @@ def data(own: Sweep) -> dict[str, Any]:
         {
             "scene": problem.path,
             "parameters": dict(problem.parameters),
-            "frames": own.study.scene.frames if problem.frames is None else problem.frames,
+            "frames": own.study.scene.frames,
             "axes": {axis.name: list(axis.values) for axis in own.axes},
             "quantity": own.name,
             "load": own.study.load,
             "machine": facts(),
+            "ran_on": _machines(own.points),
             "reference": None if own.reference is None else _reference_data(own.reference),
             "refusal": own.refusal,
             "settings": [
@@ -121,6 +122,16 @@ def data(own: Sweep) -> dict[str, Any]:
             "answers": [_answer_data(answer) for answer in own.answers],
         }
     )
+
+
+def _machines(points: Sequence[Point]) -> list[dict[str, Any]]:
+    """The machines that settings ran on, which can be others than that of the command, each once."""
+    found: list[dict[str, Any]] = []
+    for outcome in (outcome for point in points for outcome in point.outcomes):
+        machine = {name: value for name, value in outcome.machine.items() if name != "load_average"}
+        if machine not in found:
+            found.append(machine)
+    return found
 
 
 def _reference_data(reference: Reference) -> dict[str, Any]:
@@ -201,11 +212,14 @@ def _finite(value: Any) -> Any:
 
 
 def rows(own: Sweep) -> list[dict[str, Any]]:
-    """A row of plain values for each setting, as CSV has it."""
+    """A row of plain values for each setting, as CSV has it.
+
+    An axis can be called as a measured number is, such as ``cells``: its column is ``axis_cells``.
+    """
     table = []
     for record in data(own)["settings"]:
-        row = {**{axis.name: record["setting"].get(axis.name, "") for axis in own.axes}, "failure": record["failure"]}
-        row |= {"load": own.study.load, "on_front": record["on_front"]}
+        row = {f"axis_{axis.name}": record["setting"].get(axis.name, "") for axis in own.axes}
+        row |= {"failure": record["failure"], "load": own.study.load, "on_front": record["on_front"]}
         for name, value in record.items():
             if name in ("errors", "quantities"):
                 row |= {f"{name.rstrip('s') if name == 'errors' else 'value'}_{key}": own for key, own in value.items()}
