@@ -806,6 +806,16 @@ def test_what_a_run_writes_is_a_stage_of_the_same_physics(tmp_path: Path) -> Non
         np.testing.assert_array_equal(other.initial_velocity(), one.initial_velocity())
     assert [list(pin.points) for pin in again.bodies[1].supports] == [[0, 1, 2, 3, 5]]
 
+    over = tmp_path / "over.usdc"  # carries the surfaces, with their normals, that the run had drawn
+    wf.run(again, over, over=first)
+    stage = Usd.Stage.Open(str(first))
+    drawn = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/soft_one/soft_one_surface")).GetPrimvar("normals")
+    moved = Usd.Stage.Open(str(over))
+    carried = UsdGeom.PrimvarsAPI(moved.GetPrimAtPath("/World/soft_one/soft_one_surface")).GetPrimvar("normals")
+    assert len(drawn.GetIndices()) > 0 and not carried.GetIndices()
+    cosines = np.sum(np.array(drawn.ComputeFlattened(0)) * np.array(carried.ComputeFlattened(0)), axis=1)
+    assert cosines.min() > 0.995 and validation_errors(moved) == []
+
     wf.run(again, second)
     for prim in ("/World/soft_one/simulation", "/World/held/simulation"):
         np.testing.assert_allclose(points_at(second, prim, 3), points_at(first, prim, 3), rtol=0, atol=2e-5)

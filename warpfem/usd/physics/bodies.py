@@ -266,22 +266,25 @@ def _follower(view: StageView, prim: Usd.Prim) -> Follower:
     place = view.place(prim)
     bind_points = to_metres(_bind_points(view, prim, len(place.points)), place)
     mesh = UsdGeom.Mesh(prim)
-    normals = view.default_rows(prim, "normals")
-    if view.value(prim, "primvars:normals") is not None:
-        view.warn(prim, "primvars:normals stays as it is while the mesh is deformed: author normals")
-        return Follower(place, bind_points)
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
+    is_primvar = bool(primvar) and primvar.HasAuthoredValue()  # which wins over the attribute
+    name = "primvars:normals" if is_primvar else "normals"
+    normals = view.default_rows(prim, name)
     if normals is None or len(normals) == 0:
         return Follower(place, bind_points)
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(view.start) or Vt.IntArray(), np.int32)
-    interpolation, points = mesh.GetNormalsInterpolation(), np.zeros(0, np.int32)
+    indices = np.array(primvar.GetIndices(view.start) or [], np.int32) if is_primvar else np.zeros(0, np.int32)
+    if len(indices) and 0 <= indices.min() <= indices.max() < len(normals):
+        normals = normals[indices]
+    interpolation = primvar.GetInterpolation() if is_primvar else mesh.GetNormalsInterpolation()
+    points = np.zeros(0, np.int32)
     if interpolation in ("vertex", "varying"):
         points = np.arange(len(place.points), dtype=np.int32)
     elif interpolation == "faceVarying":
-        points = corners
-    if len(points) != len(normals) or (len(points) and not 0 <= points.min() <= points.max() < len(place.points)):
+        points = np.array(mesh.GetFaceVertexIndicesAttr().Get(view.start) or Vt.IntArray(), np.int32)
+    if len(points) != len(normals) or not 0 <= points.min() <= points.max() < len(place.points):
         view.warn(prim, "its normals stay as they are while it is deformed: they are not one per point or corner")
         return Follower(place, bind_points)
-    return Follower(place, bind_points, normals, points)
+    return Follower(place, bind_points, normals, points, name, len(indices) > 0)
 
 
 def governed(bodies: Iterable[Usd.Prim]) -> set[str]:
