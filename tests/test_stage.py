@@ -20,6 +20,7 @@ from warpfem.embedding import Embedding
 from warpfem.trade.problem import Problem, Setting
 from warpfem.usd import BodyFrame, OverWriter, partial_path
 from warpfem.usd.physics.reader import stage_scene
+from warpfem.usd.pictured import read_pictured_stage
 
 
 @pytest.fixture
@@ -617,6 +618,10 @@ def test_a_layer_over_a_stage_has_the_motion_and_nothing_else(tmp_path: Path) ->
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (101, 103, 24)
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", 0.01)
     assert stage.GetDefaultPrim().GetPath() == "/Body" and stage.GetPrimAtPath("/Camera")
+
+    pictured = read_pictured_stage(out)
+    assert pictured.rest()[0].max(axis=0) == pytest.approx(pictured.frame(0)[0].points.max(axis=0), abs=1e-5)
+    assert pictured.frame(2)[0].velocities is not None
 
     fall = 0.5 * 100 * GRAVITY * (2 / 24) * (2 / 24 + 1 / 120)  # cm, along local -y, as the body is turned
     for prim, rest in (("/Body/sim", 100.0 * CUBE.points), ("/Body/skin", 100.0 * SKIN_POINTS - [0, 0, 100])):
