@@ -20,6 +20,7 @@ from warpfem.embedding import Embedding
 from warpfem.trade.problem import Problem, Setting
 from warpfem.usd import BodyFrame, OverWriter, partial_path
 from warpfem.usd.physics.reader import stage_scene
+from warpfem.usd.pictured import read_pictured_stage
 
 
 @pytest.fixture
@@ -417,6 +418,15 @@ def Xform "{name}" (instanceable = true, references = @./part.usda@</Part>)
             ["/Frozen: is not simulated: physics:kinematicEnabled is true"],
         ),
         (
+            tets("Asleep", more="bool physics:startsAsleep = true"),
+            ["/Asleep: physics:startsAsleep is left out: it moves from the start"],
+        ),
+        (
+            f'def PointInstancer "Many" {{\n{tets("Seed")}\n'
+            'def Plane "Floor" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}\n}',
+            ["/Many/Seed: is not simulated: it is a proto", "/Many/Floor: is no obstacle: it is a prototype"],
+        ),
+        (
             tets("Off", more="bool physics:bodyEnabled = false"),
             ["/Off: is not simulated: physics:bodyEnabled is false"],
         ),
@@ -455,6 +465,27 @@ def test_bodies_without_a_collider_touch_obstacles_all_the_same(tmp_path: Path) 
     ground = 'def Plane "Ground" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}'
     path = write(tmp_path / "stage.usda", SCENE, tets(apis=f'"{SIMULATION}"'), MATERIAL, ground)
     assert remarks(path) == ["/sim: has no collider, but touches the obstacles all the same"]
+
+
+def test_the_friction_of_a_body_is_not_that_of_the_obstacle(tmp_path: Path) -> None:
+    ground = 'def Plane "Ground" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}'
+    rough = MATERIAL.replace("float physics:density", "float physics:staticFriction = 0.5\n    float physics:density")
+    found = remarks(write(tmp_path / "stage.usda", SCENE, tets(), rough, ground))
+    assert found == ["/sim: the friction of /Rubber is left out: that of the obstacles counts"]
+
+
+def test_without_units_numbers_are_metres(tmp_path: Path) -> None:
+    path = write(tmp_path / "stage.usda", SCENE, tets(), MATERIAL, head='upAxis = "Y"')
+    assert remarks(path) == ["it states no metersPerUnit: its numbers are taken as metres"]
+
+
+def test_a_body_may_be_higher_up(tmp_path: Path) -> None:
+    inner = f'def Xform "Parts" {{\n{tets()}\n}}'
+    body = (
+        f'def Xform "Toy" (prepend apiSchemas = ["PhysicsDeformableBodyAPI"]) {{\nfloat physics:mass = 40\n{inner}\n}}'
+    )
+    (own,) = read(write(tmp_path / "stage.usda", SCENE, body, MATERIAL)).bodies
+    assert (own.name, own.density) == ("Toy", pytest.approx(40.0))
 
 
 def test_a_stage_without_a_scene_has_the_gravity_of_the_earth(tmp_path: Path) -> None:
@@ -587,6 +618,10 @@ def test_a_layer_over_a_stage_has_the_motion_and_nothing_else(tmp_path: Path) ->
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (101, 103, 24)
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", 0.01)
     assert stage.GetDefaultPrim().GetPath() == "/Body" and stage.GetPrimAtPath("/Camera")
+
+    pictured = read_pictured_stage(out)
+    assert pictured.rest()[0].max(axis=0) == pytest.approx(pictured.frame(0)[0].points.max(axis=0), abs=1e-5)
+    assert pictured.frame(2)[0].velocities is not None
 
     fall = 0.5 * 100 * GRAVITY * (2 / 24) * (2 / 24 + 1 / 120)  # cm, along local -y, as the body is turned
     for prim, rest in (("/Body/sim", 100.0 * CUBE.points), ("/Body/skin", 100.0 * SKIN_POINTS - [0, 0, 100])):
@@ -775,6 +810,16 @@ def test_what_a_run_writes_is_a_stage_of_the_same_physics(tmp_path: Path) -> Non
         np.testing.assert_allclose(other.initial_displacement(), one.initial_displacement(), rtol=0, atol=1e-6)
         np.testing.assert_array_equal(other.initial_velocity(), one.initial_velocity())
     assert [list(pin.points) for pin in again.bodies[1].supports] == [[0, 1, 2, 3, 5]]
+
+    over = tmp_path / "over.usdc"  # carries the surfaces, with their normals, that the run had drawn
+    wf.run(again, over, over=first)
+    stage = Usd.Stage.Open(str(first))
+    drawn = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/World/soft_one/soft_one_surface")).GetPrimvar("normals")
+    moved = Usd.Stage.Open(str(over))
+    carried = UsdGeom.PrimvarsAPI(moved.GetPrimAtPath("/World/soft_one/soft_one_surface")).GetPrimvar("normals")
+    assert len(drawn.GetIndices()) > 0 and not carried.GetIndices()
+    cosines = np.sum(np.array(drawn.ComputeFlattened(0)) * np.array(carried.ComputeFlattened(0)), axis=1)
+    assert cosines.min() > 0.995 and validation_errors(moved) == []
 
     wf.run(again, second)
     for prim in ("/World/soft_one/simulation", "/World/held/simulation"):

@@ -80,7 +80,7 @@ def execute(arguments: argparse.Namespace) -> int:
     _require_stage(arguments)
     if arguments.log:
         check_log_path(arguments.log)
-    recipe = _recipe(arguments)
+    recipe = _recipe(arguments) if arguments.resume or arguments.checkpoint_every else ""
     if arguments.resume:
         scene = Checkpoint.read(checkpoint_path(out)).with_meshes(scene, recipe)
     elif not arguments.overwrite:

@@ -135,6 +135,8 @@ class OverBody:
 
     def define(self, layer: Sdf.Layer) -> None:
         """Makes the prims and the attributes, without values."""
+        for carried in self._followers:
+            carried.define(layer)
         for moving in (self._mesh, *(carried.moving for carried in self._followers)):
             for path in moving.place.instances:
                 Sdf.CreatePrimInLayer(layer, path).instanceable = False
@@ -184,7 +186,7 @@ class OverBody:
 class _MovingPoints:
     """The points of a prim, from the world to its own space."""
 
-    def __init__(self, place: Place, normals: bool = False) -> None:
+    def __init__(self, place: Place, normals: str = "") -> None:
         self.place = place
         self.attributes = {
             "points": Sdf.ValueTypeNames.Point3fArray,
@@ -192,7 +194,7 @@ class _MovingPoints:
             "extent": Sdf.ValueTypeNames.Float3Array,
         }
         if normals:
-            self.attributes["normals"] = Sdf.ValueTypeNames.Normal3fArray
+            self.attributes[normals] = Sdf.ValueTypeNames.Normal3fArray
         self._inverse = np.linalg.inv(place.to_world[:3, :3])
 
     def path(self, name: str) -> Sdf.Path:
@@ -219,12 +221,21 @@ class _Carried:
     """A mesh that a body carries along."""
 
     def __init__(self, follower: Follower, bound: Mesh) -> None:
-        self.moving = _MovingPoints(follower.place, follower.normals is not None)
+        self._name = "" if follower.normals is None else follower.normals_name
+        self._indexed = follower.indexed
+        self.moving = _MovingPoints(follower.place, self._name)
         self._embedding = Embedding(bound, follower.bind_points)
         self._at = follower.normal_points
         self._normals = None
         if follower.normals is not None:  # from the prim's space to the world
             self._normals = follower.normals @ np.linalg.inv(follower.place.to_world[:3, :3]).T
+
+    def define(self, layer: Sdf.Layer) -> None:
+        """Takes away the indices to normals, which have one for each corner now."""
+        if self._indexed:
+            path = self.moving.path(f"{self._name}:indices")
+            Sdf.JustCreatePrimAttributeInLayer(layer, path, Sdf.ValueTypeNames.IntArray)
+            layer.GetAttributeAtPath(path).default = Sdf.ValueBlock()
 
     def samples(self, label: str, x: np.ndarray, v: np.ndarray) -> Samples:
         """The values when the body's points are at ``x`` [m] with velocities ``v`` [m/s]."""
@@ -234,7 +245,7 @@ class _Carried:
             turned = self._embedding.normals(x, self._at, self._normals) @ self.moving.place.to_world[:3, :3].T
             lengths = np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), np.finfo(float).tiny)
             normals = as_float32(f"{label}, normals of {self.moving.place.path}", turned / lengths)
-            result[self.moving.path("normals")] = Vt.Vec3fArray.FromNumpy(normals)
+            result[self.moving.path(self._name)] = Vt.Vec3fArray.FromNumpy(normals)
         return result
 
 

@@ -232,7 +232,7 @@ class PicturedStage:
         points = points @ matrix[:3, :3] + matrix[3, :3]
         self._require(bool(np.abs(points).max() < LARGEST), f"finite points in {prim.GetPath()} at {time}")
         velocities = None
-        if based.GetVelocitiesAttr().HasAuthoredValue():
+        if based.GetVelocitiesAttr().Get(time) is not None:  # at rest there may be none though there are samples
             velocities = self._vectors(prim, based.GetVelocitiesAttr(), time) @ matrix[:3, :3]
             self._require(len(velocities) == len(points), f"velocities of all points of {prim.GetPath()} at {time}")
         return SurfaceFrame(points, velocities)

@@ -39,10 +39,15 @@ def read_bodies(view: StageView, pins: dict[str, np.ndarray]) -> tuple[StageBody
 
 
 def body_prim(prim: Usd.Prim) -> Usd.Prim:
-    """The prim that governs a simulation mesh: the mesh itself, or its parent if that one is the deformable body."""
-    parent = prim.GetParent()
-    if tokens.BODY_API not in applied(prim) and tokens.BODY_API in applied(parent):
-        return parent
+    """The prim that governs a simulation mesh: the nearest deformable body above, or the mesh itself if there is none.
+
+    The proposal wants it on the mesh or its parent; one that is higher up can mean nothing else.
+    """
+    above = prim
+    while above and not above.IsPseudoRoot() and not above.HasAPI(UsdPhysics.RigidBodyAPI):
+        if tokens.BODY_API in applied(above):
+            return above
+        above = above.GetParent()
     return prim
 
 
@@ -57,6 +62,8 @@ def _unique(name: str, taken: set[str]) -> str:
 def _reason_to_skip(view: StageView, prim: Usd.Prim, owner: Usd.Prim, owners: set[str]) -> str:
     if not prim.IsA(UsdGeom.TetMesh):
         return f"a volume deformable must be a TetMesh, not a {prim.GetTypeName() or 'prim without a type'}"
+    if view.is_prototype(prim):
+        return "it is a prototype of a PointInstancer"
     if str(owner.GetPath()) in owners:
         return f"{owner.GetPath()} has another simulation mesh"
     if owner.HasAPI(UsdPhysics.RigidBodyAPI):
@@ -94,6 +101,8 @@ def _body(view: StageView, prim: Usd.Prim, owner: Usd.Prim, name: str, pins: np.
     corners = rest_points[own_cells.reshape(-1, 4)]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
     youngs_modulus, poissons_ratio, density, model = _materials(view, prim, len(cells))
+    if view.switch(owner, "physics:startsAsleep", False):
+        view.warn(prim, "physics:startsAsleep is left out: it moves from the start")
     lacking = view.value(owner, tokens.NOT_HERE)
     if lacking:
         view.warn(prim, f"the scene that it comes from had {lacking}, which a stage has no words for: it runs without")
@@ -257,22 +266,25 @@ def _follower(view: StageView, prim: Usd.Prim) -> Follower:
     place = view.place(prim)
     bind_points = to_metres(_bind_points(view, prim, len(place.points)), place)
     mesh = UsdGeom.Mesh(prim)
-    normals = view.default_rows(prim, "normals")
-    if view.value(prim, "primvars:normals") is not None:
-        view.warn(prim, "primvars:normals stays as it is while the mesh is deformed: author normals")
-        return Follower(place, bind_points)
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
+    is_primvar = bool(primvar) and primvar.HasAuthoredValue()  # which wins over the attribute
+    name = "primvars:normals" if is_primvar else "normals"
+    normals = view.default_rows(prim, name)
     if normals is None or len(normals) == 0:
         return Follower(place, bind_points)
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(view.start) or Vt.IntArray(), np.int32)
-    interpolation, points = mesh.GetNormalsInterpolation(), np.zeros(0, np.int32)
+    indices = np.array(primvar.GetIndices(view.start) or [], np.int32) if is_primvar else np.zeros(0, np.int32)
+    if len(indices) and 0 <= indices.min() <= indices.max() < len(normals):
+        normals = normals[indices]
+    interpolation = primvar.GetInterpolation() if is_primvar else mesh.GetNormalsInterpolation()
+    points = np.zeros(0, np.int32)
     if interpolation in ("vertex", "varying"):
         points = np.arange(len(place.points), dtype=np.int32)
     elif interpolation == "faceVarying":
-        points = corners
-    if len(points) != len(normals) or (len(points) and not 0 <= points.min() <= points.max() < len(place.points)):
+        points = np.array(mesh.GetFaceVertexIndicesAttr().Get(view.start) or Vt.IntArray(), np.int32)
+    if len(points) != len(normals) or not 0 <= points.min() <= points.max() < len(place.points):
         view.warn(prim, "its normals stay as they are while it is deformed: they are not one per point or corner")
         return Follower(place, bind_points)
-    return Follower(place, bind_points, normals, points)
+    return Follower(place, bind_points, normals, points, name, len(indices) > 0)
 
 
 def governed(bodies: Iterable[Usd.Prim]) -> set[str]:

@@ -11,6 +11,8 @@ from warpfem.boundary import Box, Obstacle, Plane, Sphere
 from warpfem.usd.physics import tokens
 from warpfem.usd.physics.view import StageView
 
+FRICTION = ("physics:dynamicFriction", "physics:staticFriction")
+
 _ROUNDING = 1e-5
 """How far a transform may be from one without shear, relative to its size."""
 
@@ -50,6 +52,8 @@ def is_free(view: StageView, body: Usd.Prim) -> bool:
 
 
 def _reason_to_skip(view: StageView, prim: Usd.Prim) -> str:
+    if view.is_prototype(prim):
+        return "it is a prototype of a PointInstancer"
     above = prim
     while above and not above.IsPseudoRoot():
         if above.HasAPI(UsdPhysics.RigidBodyAPI):
@@ -84,8 +88,7 @@ def _friction(view: StageView, prim: Usd.Prim) -> float:
     material = view.material(prim)
     if material is None:
         return 0.0
-    dynamic = view.number(material, "physics:dynamicFriction")
-    static = view.number(material, "physics:staticFriction")
+    dynamic, static = (view.number(material, name) for name in FRICTION)
     if dynamic is not None and static is not None and static != dynamic:
         view.warn(material, f"static friction {static:g} is not told from the dynamic one, {dynamic:g}, which is taken")
     if view.number(material, "physics:restitution"):

@@ -35,12 +35,16 @@ class Follower:
         bind_points: (n, 3) float64 positions [m] that belong to the body's ``bind_points``.
         normals: (k, 3) float64 local normals that belong to them; ``None`` if the prim has none that can follow.
         normal_points: (k,) the point that each normal is at.
+        normals_name: the attribute that holds them.
+        indexed: whether the prim has indices to them, which are to go: here each corner has its own.
     """
 
     place: Place
     bind_points: np.ndarray
     normals: np.ndarray | None = None
     normal_points: np.ndarray | None = None
+    normals_name: str = "normals"
+    indexed: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from warpfem.errors import SceneError, one_line
 from warpfem.usd.physics import tokens
 from warpfem.usd.physics.attachments import read_pins
 from warpfem.usd.physics.bodies import body_prim, governed, read_bodies
-from warpfem.usd.physics.colliders import is_free, read_obstacles
+from warpfem.usd.physics.colliders import FRICTION, is_free, read_obstacles
 from warpfem.usd.physics.data import StageScene
 from warpfem.usd.physics.view import StageView, applied
 from warpfem.usd.stages import open_stage, reporting
@@ -29,6 +29,7 @@ _UNDERSTOOD = {
     tokens.POSE_API,
     tokens.ATTACHMENT,
     "PhysicsScene",
+    "PhysicsBodyAPI",
     "PhysicsCollisionAPI",
     "PhysicsMeshCollisionAPI",  # says how to approximate a collider, of which there is a warning of its own
     "PhysicsMaterialAPI",
@@ -74,8 +75,7 @@ def _what_is_there(view: StageView) -> str:
     tets = [str(prim.GetPath()) for prim in view.prims if prim.IsA(UsdGeom.TetMesh)]
     if not tets:
         return (
-            f"it has no TetMesh with {tokens.SIMULATION_API}. A surface becomes one by wf.tetrahedralize, in a scene "
-            "file"
+            f"it has no TetMesh with {tokens.SIMULATION_API}. In a scene file, wf.load_mesh fills a surface with cells"
         )
     return f"no TetMesh can be, of {', '.join(tets[:5])}: apply {tokens.SIMULATION_API} to what is to be simulated"
 
@@ -129,6 +129,9 @@ def _warn_of_bodies_that_collide(view: StageView, prims: list[Usd.Prim]) -> None
         ]
         if not colliders:
             view.warn(prim, "has no collider, but touches the obstacles all the same")
+        material = view.material(prim)
+        if material and any(view.number(material, name) for name in FRICTION):
+            view.warn(prim, f"the friction of {material.GetPath()} is left out: that of the obstacles counts")
         for other in colliders:
             if other != prim:
                 view.warn(other, f"the tetrahedra of {prim.GetPath()} touch the obstacles instead of this collider")

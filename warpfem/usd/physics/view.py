@@ -36,6 +36,8 @@ class StageView:
         for name, value in (("metersPerUnit", self.length), ("kilogramsPerUnit", self.mass)):
             if not (math.isfinite(value) and value > 0.0):
                 raise SceneError(f"{path}: {name} must be a finite number above 0, not {value:g}")
+        if not stage.HasAuthoredMetadata("metersPerUnit"):
+            warnings.warn(f"{path}: it states no metersPerUnit: its numbers are taken as metres", stacklevel=2)
         self._transforms = UsdGeom.XformCache(self.start)
 
     def warn(self, prim: Usd.Prim, reason: str) -> None:
@@ -62,6 +64,14 @@ class StageView:
                 return True
             if own and own.GetResetXformStack():
                 return False
+            prim = prim.GetParent()
+        return False
+
+    def is_prototype(self, prim: Usd.Prim) -> bool:
+        """Whether it stands for the instances of a ``PointInstancer``, and not for itself."""
+        while prim and not prim.IsPseudoRoot():
+            if prim.IsA(UsdGeom.PointInstancer):
+                return True
             prim = prim.GetParent()
         return False
 
