@@ -251,6 +251,14 @@ def test_a_setting_counts_as_within_an_error_by_its_bound():
     assert answer(ordered, own, "l2", 0.01).candidate.seconds == 2.0
 
 
+def test_no_price_is_below_what_was_paid_for_less():
+    own = reference(2e-3)  # which does not resolve the last of the errors
+    ordered = candidates([point(0.1, 1.0), point(0.05, 1.1), point(0.005, 50.0)], own, "l2")
+    assert 1.1 < answer(ordered[:2], own, "l2", 0.01).next_seconds < 50.0
+    dear = answer(ordered, own, "l2", 0.01)
+    assert (dear.candidate.seconds, dear.next_seconds) == (50.0, None)
+
+
 @pytest.mark.parametrize(
     ("errors", "target", "within", "told"),
     [

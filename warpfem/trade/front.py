@@ -174,11 +174,13 @@ def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
     """The time at which the front, continued as a power law from its last part, comes to an error [s].
 
     ``None`` if the front does not tell: errors that the reference does not resolve follow no power law, and where one
-    of them may be within the goal, others need not be looked for beyond.
+    of them may be within the goal, others need not be looked for beyond. Nor does it tell where the power law would be
+    cheaper than what was measured and is not within the goal.
     """
     resolved = [own for own in edge if own.resolved]
     if not resolved or edge[-1].error <= goal:
         return None
+    dearest = edge[-1].seconds
     edge = resolved
     tail = [own for own in edge if own.error <= TAIL * edge[-1].error]
     tail = tail if len(tail) >= LEAST_TAIL else list(edge[-LEAST_TAIL:])
@@ -188,7 +190,8 @@ def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
     slope, _ = np.polyfit(logs[:, 0], logs[:, 1], 1)
     if slope >= 0.0:
         return None
-    return float(math.exp(logs[-1, 1] + slope * (math.log(goal) - logs[-1, 0])))
+    seconds = math.exp(logs[-1, 1] + slope * (math.log(goal) - logs[-1, 0]))
+    return seconds if seconds > dearest else None
 
 
 def percent(value: float) -> str:
