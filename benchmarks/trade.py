@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from warpfem.trade.front import rounded
+
 ERRORS = ("10%", "1%", "0.1%")
 
 
@@ -154,7 +156,7 @@ def _wrapped_command(study: Study) -> list[str]:
 
 
 def _time(row: dict[str, Any]) -> str:
-    return f"{row['seconds']:.2g} s ({row['seconds_least']:.2g} to {row['seconds_most']:.2g})"
+    return f"{rounded(row['seconds'])} s ({rounded(row['seconds_least'])} to {rounded(row['seconds_most'])})"
 
 
 def _error(row: dict[str, Any], name: str, band: float) -> str:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,7 +156,6 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3, help="processes that time each (default: %(default)s)")
     parser.add_argument("--json", type=Path, help="file of the results")
     arguments = parser.parse_args()
-    os.environ.setdefault("PYTHONUNBUFFERED", "1")
     records = []
     for case in CASES:
         for target in case.errors:

@@ -547,6 +547,22 @@ def test_the_default_obstacle_stops_a_soft_body_that_falls(E):
     assert 0.0 < deepest < 0.25
 
 
+@pytest.mark.parametrize("E", [1e4, 1e6])
+def test_a_thin_box_holds_a_soft_body_that_falls(E):
+    """With the stiffness of a floor it would sink through the middle, and come out below."""
+    mesh = Mesh.rectangle((1.0, 1.0), (3, 3), origin=(0.0, 0.3))
+    slab = Box((0.5, -0.05), (4.0, 0.1))
+    scene = Scene(
+        [Body("jelly", mesh, StableNeoHookean(E=E, nu=0.3))], BackwardEuler(), gravity=(0.0, -9.81), obstacles=[slab]
+    )
+    model, state, stepper = ready(scene)
+    deepest = 0.0
+    for _ in range(40):
+        stepper.step(state, 0.02)
+        deepest = max(deepest, model.contact.depth(state.displacement))
+    assert 1e-4 < deepest < 0.025
+
+
 @pytest.mark.parametrize("kind", ["sphere", "box"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_long_step_does_not_leap_over_an_obstacle(dim, kind):

@@ -435,3 +435,49 @@ def test_selections_refuse(box, use, message):
     mesh = Mesh(box.points, box.cells, {**box.point_sets, "empty": [], "inside": inside})
     with pytest.raises(MeshError, match=re.escape(message)):
         use(mesh)
+
+
+# ---- numbers of cells
+
+
+def test_cell_data_go_with_the_cells():
+    mesh = Mesh.rectangle((1.0, 1.0), (1, 1))
+    mesh = Mesh(mesh.points, mesh.cells, cell_sets={"a": [1]}, cell_data={"E": [1, 2], "new": [True, False]})
+    assert mesh.cell_data["E"].dtype == np.float64 and not mesh.cell_data["E"].flags.writeable
+    assert repr(mesh) == "Mesh(2D, 4 points, 2 cells, cell sets: a, cell data: E, new)"
+    turned = Mesh.repaired(mesh.points, mesh.cells[:, ::-1], cell_data=mesh.cell_data)
+    for same in (mesh.quadratic(), mesh.transformed(2.0), pickle.loads(pickle.dumps(mesh)), turned):
+        assert same.cell_data["E"].tolist() == [1.0, 2.0] and same.cell_data["new"].tolist() == [1.0, 0.0]
+    assert mesh.refined().cell_data["E"].tolist() == [1.0] * 4 + [2.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ([1.0], "cell_data must be a dict"),
+        ({"": [1.0]}, "the name of cell data must be a non-empty str, not ''"),
+        ({"E": 1.0}, "cell data 'E' must have one number for each of 1 cells, not ()"),
+        ({"E": [1.0, 2.0]}, "cell data 'E' must have one number for each of 1 cells, not (2,)"),
+        ({"E": ["hard"]}, "cell data 'E' must be one number per cell, not of type <U4"),
+    ],
+)
+def test_cell_data_are_one_number_per_cell(data, message):
+    with pytest.raises(MeshError, match=re.escape(message)):
+        one_cell(TRIANGLE, cell_data=data)
+
+
+def test_values_of_sets_become_values_of_cells(box):
+    mesh = box.with_cell_set("low", lambda c: c[:, 1] < 0.5).with_cell_set("high", lambda c: c[:, 1] >= 0.5)
+    values = mesh.per_cell({"low": 1e5, "high": 2e5})
+    np.testing.assert_array_equal(values, np.where(np.isin(np.arange(box.cell_count), mesh.cell_sets["low"]), 1e5, 2e5))
+    refusals = {
+        "cell 0 (40 in all) is in none of 'high'; other cell sets of the mesh: 'low', 'twin'": {"high": 1.0},
+        "is in 'twin' and in another set with another value": {"low": 1.0, "high": 2.0, "twin": 3.0},
+        "no cell set 'lowest'": {"lowest": 1.0},
+        "the value of 'low' must be a finite number, not 'soft'": {"low": "soft"},
+    }
+    mesh = mesh.with_cell_set("twin", mesh.cell_sets["low"])
+    np.testing.assert_array_equal(mesh.per_cell({"low": 1e5, "twin": 1e5, "high": 2e5}), values)
+    for message, given in refusals.items():
+        with pytest.raises(MeshError, match=re.escape(message)):
+            mesh.per_cell(given)

@@ -329,7 +329,8 @@ def test_coordinates_are_scaled(tmp_path):
 
 @pytest.mark.parametrize("stated", ["Y", "Z", None])
 @pytest.mark.parametrize("wanted", ["Y", "Z"])
-def test_usd_comes_in_metres_and_turned(tmp_path, stated, wanted):
+def test_usd_comes_in_metres_and_turned(tmp_path, monkeypatch, stated, wanted):
+    monkeypatch.setattr("warpfem.usd.meshes.read_in_child", lambda read, path, error: read(str(path)))
     path = tmp_path / "a.usda"
     header = f'(\n    metersPerUnit = 0.01\n    upAxis = "{stated}"\n)' if stated else "(\n    metersPerUnit = 0.01\n)"
     path.write_text(f"""#usda 1.0

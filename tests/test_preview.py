@@ -19,7 +19,7 @@ from warpfem.preview.camera import USUAL
 from warpfem.preview.coloring import Coloring
 from warpfem.preview.page import Page
 from warpfem.preview.scene import Scene
-from warpfem.usd import BodyFrame, ColorScale, UsdBody, UsdWriter, read_animation
+from warpfem.usd import BodyFrame, ColorScale, UsdBody, UsdWriter, read_pictured_stage
 
 Image = pytest.importorskip("PIL.Image")
 pytest.importorskip("matplotlib")
@@ -379,7 +379,7 @@ def test_colors_show_any_scalar_of_the_file(tmp_path: Path) -> None:
 )
 def test_the_range_of_the_colors_is_that_of_all_frames(tmp_path: Path, color, lower: float, upper: float) -> None:
     path = write(tmp_path / "run.usdc", 2, 3, move=lambda points, index: points + index)
-    scale = Coloring.of(read_animation(path), color).scale
+    scale = Coloring.of(read_pictured_stage(path), color).scale
     assert (scale.lower, scale.upper) == pytest.approx((lower, upper))
 
 
@@ -392,12 +392,12 @@ def test_unknown_colors_are_refused_with_those_that_there_are(tmp_path: Path) ->
 
 def test_equilibria_are_counted_and_shown_long_enough(tmp_path: Path) -> None:
     path = write(tmp_path / "run.usdc", 2, 3, equilibria=True)
-    animation = read_animation(path)
-    assert animation.equilibria
-    assert not read_animation(write(tmp_path / "motion.usdc", 2, 3)).equilibria
+    stage = read_pictured_stage(path)
+    assert stage.equilibria
+    assert not read_pictured_stage(write(tmp_path / "motion.usdc", 2, 3)).equilibria
     assert pictures(preview(path, tmp_path / "film.gif"))[1] == [500] * 3
-    coloring = Coloring.of(animation, None)
-    page = Page(coloring, Scene(animation, coloring, None).view, 3)
+    coloring = Coloring.of(stage, None)
+    page = Page(coloring, Scene(coloring, None).view, 3)
     page.show([np.zeros((9, 9, 3))] * 3, range(3))
     assert [axes.get_title() for axes in page.figure.axes[:3]] == ["start", "load step 1 of 2", "load step 2 of 2"]
 
@@ -469,7 +469,7 @@ def test_files_that_cannot_be_drawn_are_errors(tmp_path: Path) -> None:
     other.write_text("#usda 1.0\n")
     for path, message in (
         (tmp_path / "missing.usdc", "no such file"),
-        (other, "not an animation"),
+        (other, "no mesh whose points move"),
         (empty, "no frames"),
     ):
         with pytest.raises(OutputError, match=message):

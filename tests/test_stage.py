@@ -634,6 +634,12 @@ def test_an_embedding_holds_what_is_inside_and_beyond(rng) -> None:
     embedding = Embedding(mesh, places)
     np.testing.assert_allclose(embedding.points(mesh.points), places, rtol=0, atol=1e-12)
     np.testing.assert_allclose(embedding.points(mesh.points @ A.T + 5.0), places @ A.T + 5.0, rtol=0, atol=1e-12)
+    # far outside it is the cell with the nearest centre that goes on
+    far = np.array([9.0, 0.4, -5.0])
+    nearest = mesh.cells[np.argmin(np.linalg.norm(mesh.points[mesh.cells].mean(axis=1) - far, axis=1))]
+    moves = np.ones_like(mesh.points)
+    moves[nearest] = 0.0
+    assert np.abs(Embedding(mesh, far[None]).points(moves)).max() == 0.0
     # inside it is the interpolation, also of a motion that is not affine
     inner = rng.uniform(0.0, 1.0, (50, 3))
     bent = mesh.points + 0.2 * np.sin(mesh.points[:, [1, 2, 0]])

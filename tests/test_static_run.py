@@ -9,7 +9,7 @@ import pytest
 import warpfem as wf
 from warpfem.cli import main
 from warpfem.commands.session import FAILED, OK, WRONG_USE
-from warpfem.usd import read_animation
+from warpfem.usd import read_animation, read_pictured_stage
 
 SCENES = Path(__file__).parent.parent / "scenes"
 BEAM = [str(SCENES / "cantilever.py"), "--set", "cells=2"]
@@ -45,7 +45,7 @@ def test_prints_and_stores_an_equilibrium(tmp_path, capsys):
         assert text in printed
     assert "obstacle" not in printed
     animation = read_animation(out)
-    assert animation.equilibria
+    assert read_pictured_stage(out).equilibria
     assert animation.frame_count == 2
     (start,), (end,) = animation.frame(0), animation.frame(1)
     assert (start.points[:, 1] >= 0.0).all()

@@ -43,10 +43,11 @@ EXPECTED = BLOCK.points[BLOCK.boundary_faces]
 
 @pytest.mark.parametrize(("name", "arguments"), SURFACE_FILES.items(), ids=str)
 def test_surfaces_read_back(tmp_path, name, arguments):
-    path = write(tmp_path / name, arguments)
-    np.testing.assert_allclose(corners(path), EXPECTED, atol=1e-7)
-    path = path.rename(path.with_suffix(path.suffix.upper()))
-    points, triangles = read_surface(path, scale=1e-3)
+    np.testing.assert_allclose(corners(write(tmp_path / name, arguments)), EXPECTED, atol=1e-7)
+
+
+def test_surfaces_are_scaled(tmp_path):
+    points, triangles = read_surface(write(tmp_path / "a.stl", {}).rename(tmp_path / "A.STL"), scale=1e-3)
     assert (points.dtype, triangles.dtype) == (np.float64, np.int32)
     np.testing.assert_allclose(points[triangles], 1e-3 * EXPECTED, atol=1e-10)
 

@@ -119,6 +119,7 @@ def test_a_setting_makes_its_scene(bar):
     assert scene(cells=4).bodies[0].mesh.cell_count == 64
     assert scene(dt="1/80").dt == 1 / 80
     assert scene(dt="auto").dt == "auto"  # although the parameter is a number
+    assert scene(dt="auto", **{"scene.dt": "1/80"}).dt == 1 / 80  # as the halved steps that separate errors
     assert scene(element="P2").bodies[0].mesh.order == 2
     assert scene(refine=1).bodies[0].mesh.cell_count == 4 * plain.bodies[0].mesh.cell_count
     swapped = scene(material="NeoHookean").bodies[0].material
@@ -145,12 +146,12 @@ def test_the_parameters_that_set_the_mesh_are_found(bar, tmp_path):
     assert mesh.names == {"cells", "refine"}
     assert mesh.finer(Setting(), 2.0) == Setting.of(cells=4)
     assert mesh.finer(Setting.of(cells=1), 0.5) is None
-    assert [kind_of(name, mesh) for name in ("cells", "dt", "dtype", "scene.tolerance", "E", "material")] == [
+    assert [kind_of(name, mesh) for name in ("cells", "dt", "dtype", "scene.tolerance", "line_search", "E")] == [
         "space",
         "time",
         "algebra",
         "algebra",
-        "model",
+        "algebra",
         "model",
     ]
     path = tmp_path / "by_length.py"
@@ -230,6 +231,9 @@ def test_the_front_and_its_answers():
     assert one.next_how == "extrapolated"
     assert one.next_seconds > 400.0
     assert "it is within that, too" in answer(candidates([point(0.001, 3.0)], own, "l2"), own, "l2", 0.1).sentence
+    slow = answer(candidates([point(0.2, 123.0), point(0.01, 1234.0)], own, "l2"), own, "l2", 0.25)
+    assert "123 s (123 to 123 s), off by 20 %" in slow.sentence
+    assert "the next factor of 10: 1234 s (measured), 10 times as much" in slow.sentence
     none = answer(ordered, own, "l2", 5e-4)
     assert none.candidate is None
     assert "No setting of the sweep is within 0.05 %" in none.sentence
@@ -242,6 +246,34 @@ def test_a_setting_counts_as_within_an_error_by_its_bound():
     own = reference(2e-3)
     ordered = candidates([point(0.0095, 1.0), point(0.005, 2.0)], own, "l2")
     assert answer(ordered, own, "l2", 0.01).candidate.seconds == 2.0
+
+
+@pytest.mark.parametrize(
+    ("errors", "target", "within", "told"),
+    [
+        ((0.2, 0.05, 0.0009), 0.02, True, False),  # the last may be within 0.2 % or not
+        ((0.2, 0.05, 0.0095), 0.01, False, False),  # likewise within 1 %
+        ((0.2, 0.05, 0.02), 0.01, False, True),
+        ((0.2, 0.05, 0.02), 0.03, True, True),
+    ],
+)
+def test_the_next_factor_costs_more_than_the_answer_or_is_not_told(errors, target, within, told):
+    own = reference(2e-3)
+    ordered = candidates([point(error, 2.0**k) for k, error in enumerate(errors)], own, "l2")
+    found = answer(ordered, own, "l2", target)
+    assert (found.candidate is not None, found.next_seconds is not None) == (within, told)
+    assert found.next_seconds is None or found.next_seconds > 4.0
+    assert told or "the front does not tell" in found.sentence
+
+
+def test_an_error_of_nothing_is_no_part_of_a_power_law():
+    own = reference(0.0)
+    exact = Point(Setting(), (Outcome(seconds=[50.0], times=np.arange(1.0), motion=np.full((1, 1, 1), 1.0)),))
+    ordered = candidates([point(0.2, 1.0), point(0.05, 2.0), exact], own, "l2")
+    assert answer(ordered, own, "l2", 0.01).next_seconds == 50.0
+    own = reference(1e-4)
+    none = answer(candidates([point(0.2, 1.0), point(0.05, 2.0), exact], own, "l2"), own, "l2", 5e-4)
+    assert (none.candidate.seconds, none.next_seconds) == (50.0, None)
 
 
 # ---- studies
@@ -277,6 +309,18 @@ def test_a_study_goes_on_from_what_it_has(bar, tmp_path, monkeypatch):
     assert changed.labels == ["cells=1"]
 
 
+@pytest.mark.skipif(not Path("/dev/fd").exists(), reason="tells which files are open")
+def test_motions_that_nobody_wants_are_not_open(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    settings = [Setting.of(cells=cells) for cells in range(1, 21)]
+    study(bar, tmp_path / "a", Here()).run(settings)
+    before = len(os.listdir("/dev/fd"))
+    again = study(bar, tmp_path / "a", Here())
+    points = again.run(settings[:2], 3)
+    assert len(os.listdir("/dev/fd")) <= before + 2
+    assert [outcome.motion.shape for outcome in points[1].outcomes] == [(3, 4, 2)] * 3
+
+
 def one_by_one(executor, own, settings):
     """Outcomes come while later settings are not submitted yet, as with one worker."""
     for setting in settings:
@@ -303,6 +347,26 @@ def test_runs_are_those_of_the_scene_and_of_what_it_imports(bar, tmp_path):
     assert Problem.of(bar).key(Setting()) == before
 
 
+def test_all_frames_are_not_run_again_as_the_first_ones(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    runs = Here()
+    own = study(bar, tmp_path, runs)
+    for part in (own, own.shortened(own.scene.frames), own.shortened(3)):
+        part.run([Setting()])
+    assert len(runs.labels) == 2
+
+
+def test_motions_are_compared_at_the_same_places_though_meshes_come_out_different(bar, tmp_path):
+    shuffled = "    mesh = replace(mesh, cells=np.random.default_rng().permutation(mesh.cells))\n    bar ="
+    bar.write_text("from dataclasses import replace\nimport numpy as np\n" + BAR.replace("    bar =", shuffled))
+    first = study(bar, tmp_path / "a", Here())
+    again = study(bar, tmp_path / "a", Here())
+    assert (again.scene.bodies[0].mesh.cells != first.scene.bodies[0].mesh.cells).any()
+    for other in (again, first.shortened(3), first.alone()):
+        np.testing.assert_array_equal(other.places, first.places)
+    assert (study(bar, tmp_path / "b", Here()).places[0] != first.places[0]).any()
+
+
 def test_times_under_load_are_not_mixed_with_others(bar, tmp_path, monkeypatch):
     monkeypatch.setattr("warpfem.trade.study.run_order", fake)
     setting = Setting.of(cells=2)
@@ -314,6 +378,20 @@ def test_times_under_load_are_not_mixed_with_others(bar, tmp_path, monkeypatch):
     study(bar, tmp_path, more).solve([setting])  # for its motion any load will do
     study(bar, tmp_path, more, load="parallel").solve([setting])
     assert more.labels == []
+
+
+def test_times_of_another_machine_are_not_mixed_with_those_of_this_one(bar, tmp_path, monkeypatch):
+    settings, runs = [Setting.of(cells=2)], Here()
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    study(bar, tmp_path, runs).run(settings, 2)
+    here = study(bar, tmp_path, runs)
+    for outcome in here.store.outcomes(here.problem, settings[0]):
+        outcome.machine["processor"] = "another one"
+    here.solve(settings)  # the motion is the same on all
+    assert len(runs.labels) == 2
+    (point,) = here.run(settings)
+    assert len(runs.labels) == 3
+    assert "another one" not in {outcome.machine["processor"] for outcome in point.outcomes}
 
 
 def test_what_a_lost_worker_had_in_hand_is_submitted_again(bar, tmp_path, monkeypatch):
@@ -328,6 +406,15 @@ def test_what_a_lost_worker_had_in_hand_is_submitted_again(bar, tmp_path, monkey
         study(bar, tmp_path, lost).run([Setting.of(cells=3)])
 
 
+def test_a_cluster_that_is_gone_is_a_clear_error(bar, tmp_path):
+    class Gone(Executor):
+        def submit(self, function, order):
+            raise RuntimeError("no scheduler")
+
+    with pytest.raises(OutputError, match="3 workers were lost, the last with RuntimeError: no scheduler"):
+        study(bar, tmp_path, Gone()).run([Setting()])
+
+
 def test_failures_are_results(bar, tmp_path):
     """A crash, a hang, an end, a scene that is no scene, and steps that are too long."""
     actions = {
@@ -340,8 +427,8 @@ def test_failures_are_results(bar, tmp_path):
     bar.write_text(BAR.replace("    mesh =", f"{body}    mesh ="))
     reasons, by_chance = {}, set()
     for setting in [*(Setting.of(kind=name) for name in actions), Setting.of(solver="velocity_verlet", E=1e7)]:
-        order = Order(Problem.of(bar), setting, [np.array([[1.0, 0.5]])], 1, 5.0, "serial")
-        outcome = run_order(order)
+        limit = 5.0 if setting.get("kind") == "hang" else 100.0  # to start a process alone takes 10 s at times
+        outcome = run_order(Order(Problem.of(bar), setting, [np.array([[1.0, 0.5]])], 1, limit, "serial"))
         reasons[setting.label] = outcome.failure
         by_chance |= {setting.label} if outcome.by_chance else set()
     for name, reason in {
@@ -358,8 +445,9 @@ def test_failures_are_results(bar, tmp_path):
 def test_only_failures_that_may_go_away_are_run_again(bar, tmp_path, monkeypatch):
     failures = {"1": Outcome("crashed"), "2": Outcome("killed", by_chance=True), "3": Outcome("late", limit=5.0)}
     monkeypatch.setattr("warpfem.trade.study.run_order", lambda order: failures[order.setting["cells"]])
-    settings = [Setting.of(cells=cells) for cells in failures]
-    study(bar, tmp_path, Here(), limit=5.0).run(settings)
+    settings, once = [Setting.of(cells=cells) for cells in failures], Here()
+    study(bar, tmp_path, once, limit=5.0).run(settings, 3)
+    assert once.labels == ["cells=1", "cells=2", "cells=3"]
     monkeypatch.setattr("warpfem.trade.study.run_order", fake)
     again, longer = Here(), Here()
     points = study(bar, tmp_path, again, limit=5.0).run(settings)
@@ -367,6 +455,14 @@ def test_only_failures_that_may_go_away_are_run_again(bar, tmp_path, monkeypatch
     assert [point.failure for point in points] == ["crashed", "", "late"]
     study(bar, tmp_path, longer, limit=6.0).run(settings)
     assert longer.labels == ["cells=3"]
+
+
+def test_a_scene_that_was_edited_meanwhile_is_no_failure_of_its_settings(bar):
+    order = Order(Problem.of(bar), Setting(), [np.array([[1.0, 0.5]])], 1, 100.0, "serial")
+    bar.write_text(BAR + "# edited")
+    outcome = measure(order)
+    assert "not the file that the study was begun with" in outcome.failure
+    assert outcome.by_chance  # once that is undone it is run again
 
 
 def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_process):
@@ -385,11 +481,30 @@ def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_proce
     assert 1.0 < found.parts["l2"]["time"].order < 4.0
 
 
+def test_the_steps_of_the_reference_are_not_those_of_explicit_settings(bar, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    runs = Here()
+    own = study(bar, tmp_path, runs)
+    asked = own.run([Setting.of(cells=1, dt="1/40"), Setting.of(cells=1, solver="velocity_verlet", dt="auto")])
+    for asked_point, dt, iterations in zip(asked, (1 / 40, 1e-4), (30, 0), strict=True):
+        asked_point.first.shortest_dt = asked_point.first.longest_dt = dt
+        asked_point.first.newton_iterations = iterations
+    build_reference(own, mesh_control(own.problem), asked)
+    assert {label.rpartition("dt=")[2] for label in runs.labels[2:]} == {"1/20", "1/40", "1/80"}
+
+
 def test_nothing_is_measured_where_nothing_moves(bar, tmp_path, in_process):
     bar.write_text(BAR.replace("gravity=(0, -1)", "gravity=None"))
     own = study(bar, tmp_path / "a", Here())
     with pytest.raises(SimulationError, match="nothing moves"):
         build_reference(own, mesh_control(own.problem), own.run([Setting()]))
+
+
+def test_errors_are_not_relative_to_nothing(bar, tmp_path, in_process):
+    bar.write_text(BAR.replace('{"tip": tip}', '{"nothing": lambda motion: 0.0}'))
+    own = study(bar, tmp_path / "a", Here())
+    with pytest.raises(SimulationError, match="the reference has 0 for 'nothing'"):
+        build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)]), "nothing")
 
 
 def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, capsys):
@@ -415,6 +530,8 @@ def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, ca
         table = list(csv.DictReader(file))
     assert [row["failure"] != "" for row in table] == [record["failure"] != "" for record in data["settings"]]
     assert float(table[0]["error_l2"]) == data["settings"][0]["errors"]["l2"]
+    assert [row["axis_cells"] for row in table] == [record["setting"]["cells"] for record in data["settings"]]
+    assert int(table[0]["cells"]) == data["settings"][0]["cells"] == 4  # those of the mesh of cells=1
     for name in ("trade.png", "trade.svg"):
         assert (out / name).stat().st_size > 10_000
     lines = (out / "runs.jsonl").read_text().count("\n")
@@ -430,6 +547,8 @@ def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, ca
         (["trade", "missing.py"], "no scene file"),
         (["trade", "bar.py", "--axis", "cels=1"], "did you mean 'cells'"),
         (["trade", "bar.py", "--quantity", "tipp"], "there is no quantity 'tipp'"),
+        (["trade", "bar.py", "--set", "cells=few"], "cells must be of type int, like 2, not 'few'"),
+        (["trade", "bar.py", "--set", "dt=1/48"], "dt must be of type float"),
     ],
 )
 def test_wrong_use_is_said_before_anything_is_run(bar, tmp_path, monkeypatch, capsys, arguments, message):
@@ -438,8 +557,18 @@ def test_wrong_use_is_said_before_anything_is_run(bar, tmp_path, monkeypatch, ca
     assert message in capsys.readouterr().err
 
 
+def test_quantities_are_not_called_as_norms_are(bar, tmp_path, capsys):
+    bar.write_text(BAR.replace('"tip": tip', '"max": tip'))
+    assert main(["trade", str(bar), "--out", str(tmp_path / "out")]) == WRONG_USE
+    assert "a quantity cannot be called 'max'" in capsys.readouterr().err
+
+
 def test_a_study_whose_every_setting_fails_says_so(bar, tmp_path, in_process, capsys):
-    assert main(["trade", str(bar), "--axis", "element=cubic", "--out", str(tmp_path / "out")]) == FAILED
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "trade.png").write_text("of the study before")
+    assert main(["trade", str(bar), "--axis", "element=cubic", "--out", str(out)]) == FAILED
+    assert not (out / "trade.png").exists()
     assert "No reference: there is no reference: every setting failed" in capsys.readouterr().out
 
 

@@ -1,6 +1,7 @@
 """Tuning: the search for the cheapest setting within an error, and the files of settings."""
 
 import json
+import shlex
 import tomllib
 import zlib
 from concurrent.futures import Executor, Future
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.cli import main
+from warpfem.cli import main, parser
 from warpfem.commands.session import FAILED, OK, WRONG_USE
+from warpfem.commands.tune import _tune_command
 from warpfem.errors import SceneError, SimulationError
 from warpfem.motion import Motion
 from warpfem.solvers.implicit import ImplicitSolver
@@ -103,10 +105,11 @@ class Law:
         stiffness: explicit steps of a cell's size at the coarsest.
         late: by what errors grow after half of the frames.
         noise: errors that no refinement reduces.
+        opposed: the part of the errors in time that makes up for those in space.
     """
 
-    def __init__(self, stiffness: float = 20.0, late: float = 1.0, noise: float = 0.0) -> None:
-        self.stiffness, self.late, self.noise = stiffness, late, noise
+    def __init__(self, stiffness: float = 20.0, late: float = 1.0, noise: float = 0.0, opposed: float = 0.0) -> None:
+        self.stiffness, self.late, self.noise, self.opposed = stiffness, late, noise, opposed
         self.runs = 0
 
     def __call__(self, order: Order) -> Outcome:
@@ -130,7 +133,8 @@ class Law:
         times = interval * np.arange(scene.frames + 1)
         later = np.where(times > 4.5 * interval, self.late, 1.0)
         chance = np.random.default_rng(zlib.crc32(setting.canonical.encode())).normal(size=2)
-        own = np.array([0.5 * in_space, 0.1 * in_time]) + self.noise * chance
+        own = np.array([0.5 * in_space, (1.0 - self.opposed) * 0.1 * in_time]) + self.noise * chance
+        own[0] -= self.opposed * 0.1 * in_time
         places = sum(map(len, order.places))
         motion = np.sin(times)[:, None, None] * (1.0 + later[:, None, None] * own) * np.ones((1, places, 1))
         return Outcome(
@@ -188,21 +192,22 @@ def true_error(outcome: Outcome, name: str) -> float:
 
 
 @pytest.mark.parametrize(
-    ("stiffness", "late", "target", "name"),
+    ("stiffness", "late", "opposed", "target", "name"),
     [
-        (5.0, 1.0, 0.01, "l2"),  # explicit steps win
-        (1e4, 1.0, 0.01, "l2"),  # only implicit ones can be
-        (200.0, 1.0, 0.1, "l2"),
-        (200.0, 1.0, 0.001, "l2"),
-        (200.0, 4.0, 0.01, "l2"),  # the frames that the search has not seen are harder
-        (200.0, 0.1, 0.01, "l2"),  # or easier
-        (200.0, 1.0, 0.01, "tip"),
+        (5.0, 1.0, 0.0, 0.01, "l2"),  # explicit steps win
+        (1e4, 1.0, 0.0, 0.01, "l2"),  # only implicit ones can be
+        (200.0, 1.0, 0.0, 0.1, "l2"),
+        (200.0, 1.0, 1.0, 0.02, "l2"),  # the errors of the longest steps make up for those of the coarsest meshes
+        (200.0, 1.0, 0.0, 0.001, "l2"),
+        (200.0, 4.0, 0.0, 0.01, "l2"),  # the frames that the search has not seen are harder
+        (200.0, 0.1, 0.0, 0.01, "l2"),  # or easier
+        (200.0, 1.0, 0.0, 0.01, "tip"),
     ],
 )
 def test_what_is_found_is_within_the_error_at_little_more_than_the_least_cost(
-    bar, monkeypatch, stiffness, late, target, name
+    bar, monkeypatch, stiffness, late, opposed, target, name
 ):
-    law = Law(stiffness, late)
+    law = Law(stiffness, late, opposed=opposed)
     study = study_of(bar, law, monkeypatch)
     found = tune(study, mesh_control(study.problem), name, target, repeats=1)
     runs = law.runs
@@ -264,6 +269,11 @@ def test_the_command_writes_settings_that_run_takes(bar, tmp_path, monkeypatch, 
     printed = capsys.readouterr()
     assert "The cheapest setting found within 2 % of the motion (L2)" in printed.out
     assert "which the search has not seen" in printed.out and "s of steps" not in printed.err
+
+
+def test_the_command_that_a_file_tells_of_can_be_given_again(tmp_path):
+    words = ["tune", str(tmp_path / "my bar.py"), "--error", "0.02", "--set", "kind=a b", "--quantity", "tip sag"]
+    assert shlex.split(_tune_command(parser().parse_args(words))) == ["warpfem", *words]
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from warpfem.usd import (
     animation,
     read_animation,
     read_mesh,
+    read_pictured_stage,
     read_surface_mesh,
 )
 
@@ -339,18 +340,18 @@ def test_scalars_of_a_surface_are_read_at_the_corners_of_its_faces(tmp_path: Pat
     short = primvars.CreatePrimvar("short", Sdf.ValueTypeNames.IntArray, tokens.vertex)
     short.Set([1, 2])
     stage.Save()
-    animation = read_animation(tmp_path / "run.usdc")
-    assert set(animation.primvars) == {*expected, "indexed", "short", "J", "JPoint", "vonMises", "vonMisesPoint"}
+    stage = read_pictured_stage(tmp_path / "run.usdc")
+    assert set(stage.primvars) == {*expected, "indexed", "short", "J", "JPoint", "vonMises", "vonMisesPoint"}
     for index in range(2):
         for name, values in expected.items():
-            (read,) = animation.surface_values(name, index)
+            (read,) = stage.values(name, index)
             assert np.array_equal(read, values + index), name
-        (read,) = animation.surface_values("indexed", index)
+        (read,) = stage.values("indexed", index)
         assert np.array_equal(read[:, 0], 3.0 + np.arange(len(faces)) % 2)
     with pytest.raises(
-        OutputError, match="lacks primvars:short of /World/block/block_surface at 0, one number for each"
+        OutputError, match=r"lacks primvars:short of /World/block/block_surface at 0.0, one number for each"
     ):
-        animation.surface_values("short", 0)
+        stage.values("short", 0)
 
 
 @pytest.mark.parametrize("dim", SETUPS)

@@ -191,7 +191,8 @@ class Box(_Obstacle):
         size: full lengths of the edges along ``axes`` [m], > 0.
         axes: directions of the edges, perpendicular to each other and of any length; ``None`` for x, y and z.
         friction: Coulomb coefficient, >= 0.
-        stiffness: pressure per depth [Pa/m]; ``None`` as for :class:`Plane`.
+        stiffness: pressure per depth [Pa/m]; ``None`` as for :class:`Plane`, but a body is stopped within an eighth of
+            the box's least size, if that is less.
     """
 
     center: Vector

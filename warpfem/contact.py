@@ -27,6 +27,9 @@ STOPPING_DEPTH = 0.25
 """Part of a body's thickness within which the default stiffness stops it, from the speed that it starts with and
 gains as it falls."""
 
+BOX_STOPPING_DEPTH = 0.125
+"""Part of a box's least size within which its default stiffness stops a body: half of the way to its core."""
+
 
 @functools.cache
 def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
@@ -349,6 +352,8 @@ class _ObstacleContact:
         height = np.maximum(self._gap(obstacle, surface.rest), 0.0) + surface.stopping_depth
         fall = np.maximum(-(surface.gravity * outward).sum(axis=-1), 0.0) * height
         default = np.maximum(surface.stiffness, surface.stopping * (approach**2 + 2.0 * fall))
+        if isinstance(obstacle, Box):
+            default = np.maximum(default, surface.box_stiffness(obstacle, outward, np.sqrt(approach**2 + 2.0 * fall)))
         pressure_rate = default if obstacle.stiffness is None else obstacle.stiffness
         self.form = form
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
@@ -406,7 +411,8 @@ class ContactSurface:
 
     ``stopping`` times v^2 + 2 g h is the stiffness [Pa/m] that stops a body within ``STOPPING_DEPTH``, which starts
     towards an obstacle at the speed v and falls on it from the height h: per area, k d^2 / 2 = rho L (v^2 / 2 + g h)
-    for a body of thickness L that hits with all its mass; h counts the depth d.
+    for a body of thickness L that hits with all its mass; h counts the depth d. ``impedance`` is rho c for P-waves of
+    speed c [kg/(m^2 s)].
     """
 
     def __init__(
@@ -417,7 +423,7 @@ class ContactSurface:
         gravity: Sequence[float] | None,
         device,
     ) -> None:
-        rest, points, areas, stiffness, velocity, stopping, depth = [], [], [], [], [], [], []
+        rest, points, areas, stiffness, velocity, stopping, depth, impedance = [], [], [], [], [], [], [], []
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
             mesh = body.mesh
             rest.append(mesh.points[mesh.boundary_points])
@@ -429,6 +435,7 @@ class ContactSurface:
             inertia = np.max(body.density) / (STOPPING_DEPTH**2 * thickness)
             stopping.append(np.full(len(mesh.boundary_points), inertia))
             depth.append(np.full(len(mesh.boundary_points), STOPPING_DEPTH * thickness))
+            impedance.append(np.full(len(mesh.boundary_points), np.sqrt(np.max(body.density) * modulus)))
         self.device = device
         self.gravity = np.zeros(bodies[0].mesh.dim) if gravity is None else np.asarray(gravity, dtype=np.float64)
         self.stopping_depth = np.concatenate(depth)
@@ -439,6 +446,24 @@ class ContactSurface:
         self.stiffness = np.concatenate(stiffness)
         self.velocity = np.concatenate(velocity)
         self.stopping = np.concatenate(stopping)
+        self.impedance = np.concatenate(impedance)
+
+    def box_stiffness(self, box: Box, outward: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """The stiffness [Pa/m] that stops points within ``BOX_STOPPING_DEPTH``: from a thin box they come out behind.
+
+        What is asked for is the least of two bounds: a rigid body gives all its energy to the penalty; one that
+        deforms meets it with the pressure of its P-waves, rho c v (Achenbach 1973), and twice its weight.
+
+        Args:
+            box: the box.
+            outward: (k, dim) its outward normals at the points.
+            speed: (k,) with which they meet it [m/s].
+        """
+        depth = BOX_STOPPING_DEPTH * min(box.size)
+        inertia = self.stopping * self.stopping_depth**2  # rho L
+        weight = inertia * np.maximum(-(self.gravity * outward).sum(axis=1), 0.0)
+        rigid = inertia * speed**2 / depth**2
+        return np.minimum(rigid, self.impedance * speed / depth) + 2.0 * weight / depth
 
 
 class Contact:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,12 @@ NEWTON_STEPS = 8
 MOST_OUTSIDE = 0.5
 """How far outside of the nearest cell, in barycentric coordinates, a place may lie: meshes of different fineness round
 a curved surface off differently."""
+
+MOST_BOXES = 64
+"""Boxes of the grid per cell, on average, in which places are looked for."""
+
+PAIRS_AT_ONCE = 1 << 18
+"""Places and cells whose distances are computed at a time: 50 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,34 +64,79 @@ def locate(mesh: Mesh, places: np.ndarray, extrapolate: bool = False) -> Places:
     corners = mesh.points[mesh.corners]
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     pad = MOST_OUTSIDE * np.ptp(corners, axis=1).max(axis=1, keepdims=True)
-    lower, upper = corners.min(axis=1) - pad, corners.max(axis=1) + pad
-    order = np.argsort(lower[:, 0])
-    starts, widest = lower[order, 0], float((upper - lower)[:, 0].max())
-    cells = np.empty(len(places), dtype=np.int64)
-    coordinates = np.empty((len(places), mesh.dim + 1))
-    for index, place in enumerate(places):
-        first, last = np.searchsorted(starts, [place[0] - widest, place[0]], side="right")
-        near = order[first:last]
-        near = near[((lower[near] <= place) & (place <= upper[near])).all(axis=1)]
-        barycentric = _barycentric(place, corners[near, 0], inverse[near])
-        if not len(near) or barycentric.min(axis=1).max() < -MOST_OUTSIDE:
-            if not extrapolate:
-                raise MeshError(f"the place {place.tolist()} is not in the body")
-            near = np.argmin(((corners.mean(axis=1) - place) ** 2).sum(axis=1), keepdims=True)
-            barycentric = _barycentric(place, corners[near, 0], inverse[near])
-        depth = barycentric.min(axis=1)
+    cells = np.full(len(places), mesh.cell_count, dtype=np.int64)
+    for place, cell in _near(corners.min(axis=1) - pad, corners.max(axis=1) + pad, places):
+        depth = _barycentric(places[place], corners[cell, 0], inverse[cell]).min(axis=1)
+        deepest = np.full(len(places), -np.inf)
+        np.maximum.at(deepest, place, depth)
         # of the cells that share a place the one of the least number, whatever rounding says
-        best = int(near[depth >= min(-ROUNDING, float(depth.max()))].min())
-        cells[index], coordinates[index] = best, barycentric[near == best][0]
+        good = (depth >= np.minimum(-ROUNDING, deepest[place])) & (deepest[place] >= -MOST_OUTSIDE)
+        np.minimum.at(cells, place[good], cell[good])
+    far = np.flatnonzero(cells == mesh.cell_count)
+    if len(far) and not extrapolate:
+        raise MeshError(f"the place {places[far[0]].tolist()} is not in the body")
+    centers = corners.mean(axis=1)
+    for some in np.array_split(far, 1 + len(far) * len(centers) // (16 * PAIRS_AT_ONCE)):
+        cells[some] = np.argmin((centers**2).sum(axis=1) - 2.0 * places[some] @ centers.T, axis=1)
+    coordinates = _barycentric(places, corners[cells, 0], inverse[cells])
     own = shape(mesh.dim, mesh.order)
     if mesh.order == 2:
         coordinates = _curved(mesh, cells, coordinates, places)
     return Places(mesh.cells[cells], own.values(coordinates))
 
 
-def _barycentric(place: np.ndarray, origins: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (c, dim + 1) of a place in cells with these first corners and inverted edges."""
-    inner = np.einsum("cij,cj->ci", inverse, place - origins)
+def _near(lower: np.ndarray, upper: np.ndarray, places: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pairs of a place and a cell whose bounds contain it, some places with all their cells at a time.
+
+    They are found by a regular grid, whose boxes know the cells that reach into them.
+
+    Args:
+        lower, upper: bounds of the cells (c, dim) [m].
+        places: (k, dim) [m].
+
+    Yields:
+        Indices of places and of cells, one of each for a pair.
+    """
+    origin, width = lower.min(axis=0), float((upper - lower).mean())
+    while True:
+        first = np.floor((lower - origin) / width).astype(np.int64)
+        spans = np.floor((upper - origin) / width).astype(np.int64) - first + 1
+        counts = spans.prod(axis=1)
+        if counts.sum() <= MOST_BOXES * len(lower):
+            break
+        width *= 2.0
+    shape = (first + spans).max(axis=0)
+    owners, within = _ranges(counts)
+    boxes = np.zeros((len(owners), len(shape)), dtype=np.int64)
+    for axis, span in enumerate(spans[owners].T):
+        boxes[:, axis] = first[owners, axis] + within % span
+        within = within // span
+    keys = np.asarray(np.ravel_multi_index(tuple(boxes.T), tuple(shape)))
+    order = np.argsort(keys, kind="stable")
+    keys, owners = keys[order], owners[order]
+
+    at = np.floor((places - origin) / width).astype(np.int64)
+    inside = np.flatnonzero(((at >= 0) & (at < shape)).all(axis=1))
+    own = np.asarray(np.ravel_multi_index(tuple(at[inside].T), tuple(shape)))
+    begins = np.searchsorted(keys, own, side="left")
+    counts = np.searchsorted(keys, own, side="right") - begins
+    portions = np.cumsum(counts) // PAIRS_AT_ONCE
+    for portion in np.split(np.arange(len(inside)), np.flatnonzero(np.diff(portions)) + 1):
+        number, within = _ranges(counts[portion])
+        place, cell = inside[portion[number]], owners[begins[portion[number]] + within]
+        contains = ((lower[cell] <= places[place]) & (places[place] <= upper[cell])).all(axis=1)
+        yield place[contains], cell[contains]
+
+
+def _ranges(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each i the numbers 0..counts[i] - 1, one range after the other: i and the number, each (counts.sum(),)."""
+    owners = np.repeat(np.arange(len(counts)), counts)
+    return owners, np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _barycentric(places: np.ndarray, origins: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (c, dim + 1) of places in cells with these first corners and inverted edges."""
+    inner = np.einsum("cij,cj->ci", inverse, places - origins)
     return np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
 
 

@@ -53,10 +53,10 @@ def largest_displacement(body: str, at: Sequence[float], axis: int) -> Quantity:
 
 
 def period(body: str, at: Sequence[float], axis: int) -> Quantity:
-    """The period of the oscillation along an axis of a place of a body about its mean over time [s].
+    """The period of the oscillation along an axis of a place of a body [s].
 
-    It is the mean distance of upward crossings of the mean, and of downward ones, interpolated between frames: frames
-    should be a tenth of the period apart, or less.
+    It is the mean distance of upward crossings of the middle between the extremes over time, and of downward ones,
+    interpolated between frames: frames should be a tenth of the period apart, or less.
 
     Args:
         body: its name.

@@ -97,9 +97,9 @@ def read_back(path: Path) -> list[str]:
                 problems.append(f"read_animation: frame {index} of {body.name} differs")
     bodies = load_scene(SCENES / f"{path.stem}.py").bodies
     if len(bodies) == 1 and bodies[0].mesh.dim == 3 and path.stem != "bear":  # which is another mesh each time
-        mesh, own = wf.read_mesh(path), bodies[0].mesh
+        mesh, own = wf.load_mesh(path), bodies[0].mesh
         if not (np.array_equal(mesh.cells, own.linear_cells) and np.array_equal(mesh.points, np.float32(own.points))):
-            problems.append("read_mesh: the mesh differs")
+            problems.append("load_mesh: the mesh differs")
     return problems
 
 

@@ -12,7 +12,12 @@ from warpfem.commands.session import OK
 def add(commands: Any) -> None:
     """Adds the command to the parser."""
     preview = commands.add_parser("preview", help="draw a run to PNG, GIF or MP4", description=execute.__doc__)
-    preview.add_argument("file", type=Path, metavar="FILE", help="a USD file that warpfem wrote, partial ones included")
+    preview.add_argument(
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="a USD file that warpfem wrote, partial ones included, or any with meshes that move",
+    )
     preview.add_argument(
         "-o",
         "--out",

@@ -13,6 +13,7 @@ from warpfem.commands.options import parameters_of, positive, relative_error, st
 from warpfem.commands.session import FAILED, OK, fail, start_warp
 from warpfem.commands.study import opened_study
 from warpfem.errors import MissingExtraError, SimulationError
+from warpfem.files import remove
 
 if TYPE_CHECKING:
     from warpfem.trade.sweep import Sweep
@@ -74,7 +75,7 @@ def execute(arguments: argparse.Namespace) -> int:
     or none that is good enough for an error that was asked for.
     """
     from warpfem.trade import report
-    from warpfem.trade.plot import plot
+    from warpfem.trade.plot import plot, plots
 
     say = (lambda text: None) if arguments.json else (lambda text: print(text, file=sys.stderr, flush=True))
     out = arguments.out or Path("output") / f"{arguments.scene.stem}.trade"
@@ -83,6 +84,8 @@ def execute(arguments: argparse.Namespace) -> int:
         done = _sweep(arguments, out, say)
     except KeyboardInterrupt:
         return fail(SimulationError(f"interrupted: what has been run is in {out}, and the command goes on"), FAILED)
+    for path in plots(out):
+        remove(path)  # they would be another study's, if there is none of this one
     written = report.write(done, out)
     if done.reference is not None:
         try:

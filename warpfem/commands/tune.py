@@ -41,8 +41,9 @@ def execute(arguments: argparse.Namespace) -> int:
     it to a file that `warpfem run SCENE --settings FILE` takes.
 
     Settings are tried on the first half of the frames, and what is found is verified on the others, against a reference
-    that is finer in space and time; without one that is accurate enough the search is refused, with exit code 1. Runs
-    are kept in output/SCENE.trade, where those of `warpfem trade` are, and not repeated.
+    that is finer in space and time; of a quantity, which is a number of the whole motion, on all frames. Without a
+    reference that is accurate enough the search is refused, with exit code 1. Runs are kept in output/SCENE.trade,
+    where those of `warpfem trade` are, and not repeated.
     """
     from warpfem.trade import tuning_report
     from warpfem.trade.axes import mesh_control
@@ -73,7 +74,8 @@ def execute(arguments: argparse.Namespace) -> int:
 
 def _tune_command(arguments: argparse.Namespace) -> str:
     """The command as one would write it, without what does not bear on its result."""
-    given = [f"--set {text}" for text in arguments.parameters]
-    given += [] if arguments.frames is None else [f"--frames {arguments.frames}"]
-    given += [] if arguments.quantity == "l2" else [f"--quantity {shlex.quote(arguments.quantity)}"]
-    return " ".join(["warpfem tune", str(arguments.scene), f"--error {arguments.error:g}", *given])
+    words = ["warpfem", "tune", str(arguments.scene), "--error", f"{arguments.error:g}"]
+    words += [word for text in arguments.parameters for word in ("--set", text)]
+    words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]
+    words += [] if arguments.quantity == "l2" else ["--quantity", arguments.quantity]
+    return shlex.join(words)

@@ -1,4 +1,4 @@
-"""Films: the frames of an animation one after the other, as GIF or MP4."""
+"""Films: the frames of a motion one after the other, as GIF or MP4."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Film:
     """The frames of a film.
 
     Attributes:
-        chosen: the frames of the animation that are shown.
+        chosen: the frames of the motion that are shown.
         times: when each of them begins, and when the last one ends [s of the film], (len(chosen) + 1,).
     """
 
@@ -31,22 +31,22 @@ class Film:
         """Chooses the frames.
 
         Args:
-            coloring: the animation and its colours.
+            coloring: the motion and its colours.
             scene: what draws its frames.
             most: the most frames.
             shortest: how long a frame is shown at least [s]: viewers slow down shorter ones.
         """
-        animation = coloring.animation
+        stage = coloring.stage
         self._scene, self._page = scene, Page(coloring, scene.view, 1)
-        rate = animation.fps
-        if animation.frame_count < rate:
+        rate = stage.fps
+        if stage.frame_count < rate:
             rate = min(rate, _SLOW_MOTION)
-        rate = _LEAST_RATE if animation.equilibria else max(rate, _LEAST_RATE)
-        stride = max(math.ceil(animation.frame_count / most), math.ceil(shortest * rate))
-        self.chosen = range(0, animation.frame_count, stride)
-        self.times = np.array([*self.chosen, animation.frame_count]) / rate
+        rate = _LEAST_RATE if stage.equilibria else max(rate, _LEAST_RATE)
+        stride = max(math.ceil(stage.frame_count / most), math.ceil(shortest * rate))
+        self.chosen = range(0, stage.frame_count, stride)
+        self.times = np.array([*self.chosen, stage.frame_count]) / rate
         self.rate = rate / stride
-        self._pace = "" if animation.equilibria else _pace(rate / animation.fps)
+        self._pace = "" if stage.equilibria else _pace(rate / stage.fps)
 
     def images(self) -> Iterator[np.ndarray]:
         """The frames with what is around them: (height, width, 3) uint8 each."""

@@ -19,12 +19,11 @@ class Obstacle:
     is_plane: bool
 
     @classmethod
-    def whole(cls, corners: np.ndarray, flat: bool) -> Obstacle:
+    def whole(cls, corners: np.ndarray, is_plane: bool, flat: bool) -> Obstacle:
         """All of an obstacle in a file, which holds just a piece of a plane: two triangles.
 
         In 2D that piece is a strip on the solid side, and its first two corners are on the surface.
         """
-        is_plane = len(corners) == 2
         if is_plane:
             middle = corners[0, :2].mean(axis=0) if flat else corners.mean(axis=(0, 1))
             corners = middle + 1e4 * (corners - middle)

@@ -32,7 +32,7 @@ class Page:
         total_height = math.ceil(count / columns) * (height + title) + gap
         self.figure = Figure(figsize=(total_width / 100, total_height / 100), dpi=100)
         self._canvas = FigureCanvasAgg(self.figure)
-        self._animation = coloring.animation
+        self._stage = coloring.stage
         self._images, self._titles = [], []
 
         def place(left: float, top: float, width: float, height: float) -> Axes:
@@ -65,9 +65,9 @@ class Page:
             title.set_text(self._moment(frame) + remark)
 
     def _moment(self, frame: int) -> str:
-        if self._animation.equilibria:
-            return f"load step {frame} of {self._animation.frame_count - 1}" if frame else "start"
-        fps = self._animation.fps
+        if self._stage.equilibria:
+            return f"load step {frame} of {self._stage.frame_count - 1}" if frame else "start"
+        fps = self._stage.fps
         return f"{frame / fps:.{max(1, math.ceil(math.log10(fps)))}f} s"
 
     def pixels(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""From an animation to a file: a sheet of frames, or a film."""
+"""From a stage to a file: a sheet of frames, or a film."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from warpfem.preview.coloring import Coloring
 from warpfem.preview.film import Film, require_encoder, write_gif, write_mp4
 from warpfem.preview.page import Page
 from warpfem.preview.scene import Scene
-from warpfem.usd import read_animation
+from warpfem.usd import read_pictured_stage
 
 MOST_FRAMES = {".png": 6, ".gif": 120, ".mp4": 480}
 """Frames in a preview, unless another number is asked for."""
@@ -28,7 +28,7 @@ def preview(
     camera: str | None = None,
     color: str | None = None,
 ) -> Path:
-    """Draws an animation that warpfem wrote.
+    """Draws the motion in a USD file, of warpfem or of others.
 
     One camera without perspective fits the whole motion and what obstacles are near it. It looks straight at 2D
     scenes; at 3D ones from the front, above and the right, or from the left if planes lean to that side, unless
@@ -37,22 +37,23 @@ def preview(
     from behind are glass.
 
     Args:
-        path: an animation, finished or partial, of a run or of a static solve.
+        path: what a run or a static solve wrote, finished or partial, or any stage with meshes whose points move: of
+            such a stage meshes, planes, cubes and spheres are drawn.
         out: the file to write. ``.png``: a sheet of evenly spaced frames, first and last included. ``.gif`` and
             ``.mp4``: the motion in real time, without the frames that would be too many or too short; runs of less
             than a second are slowed down to 25 frames per second.
         frames: the most frames to draw; ``None`` for those of ``MOST_FRAMES``.
         camera: one of ``CAMERAS``, or azimuth and elevation such as ``"30,20"`` [degrees]; 3D only.
         color: what the colours show: a scalar primvar of the file such as ``"J"``, per cell or per point, or
-            ``"displacement"`` or ``"speed"``, with the range that it has in all frames. ``None``: what the file's own
-            colours show, with their range.
+            ``"displacement"`` or ``"speed"``, with the range that it has in all frames. ``None``: what the colours of a
+            file of warpfem show, with their range, and the displacement in others.
 
     Returns:
         The path of the picture.
 
     Raises:
         OutputError: ``out`` has another suffix or cannot be written, ``frames`` is below 1, ``camera`` or ``color``
-            is unknown, or ``path`` is missing, not an animation, or has no frames.
+            is unknown, or ``path`` is missing, not USD, or has nothing that moves.
         MissingExtraError: Matplotlib or Pillow is not installed, or imageio-ffmpeg for ``.mp4``.
     """
     if not isinstance(out, str | os.PathLike):
@@ -67,12 +68,12 @@ def preview(
         raise MissingExtraError("drawing a preview", error.name or "matplotlib", "plot") from error
     if out.suffix == ".mp4":
         require_encoder()
-    animation = read_animation(path)
-    if not animation.frame_count:
+    stage = read_pictured_stage(path)
+    if not stage.frame_count:
         raise OutputError(f"{path} has no frames to draw: the run ended before the first one was saved")
 
-    coloring = Coloring.of(animation, color)
-    scene = Scene(animation, coloring, direction)
+    coloring = Coloring.of(stage, color)
+    scene = Scene(coloring, direction)
     most = frames or MOST_FRAMES[out.suffix]
     try:
         with replacing(out) as temporary:
@@ -99,7 +100,7 @@ def _check_settings(out: Path, frames: int | None) -> None:
 
 
 def _write_sheet(path: Path, coloring: Coloring, scene: Scene, most: int) -> None:
-    frame_count = coloring.animation.frame_count
+    frame_count = coloring.stage.frame_count
     chosen = np.linspace(0, frame_count - 1, min(most, frame_count)).round().astype(int).tolist()
     page = Page(coloring, scene.view, len(chosen))
     page.show([scene.image(index) for index in chosen], chosen)

@@ -11,7 +11,6 @@ from warpfem.preview.camera import USUAL, View, camera_axes
 from warpfem.preview.canvas import Canvas, covered
 from warpfem.preview.coloring import Coloring
 from warpfem.preview.obstacles import Obstacle, normals_of
-from warpfem.usd import Animation
 
 _LIGHT = np.array([-0.4, 0.7, 0.6])
 """Where the light comes from, in the axes of the image: right, up, towards the viewer."""
@@ -22,26 +21,27 @@ _TILE, _SHADOW, _PANE = 0.94, 0.76, 0.2
 
 
 class Scene:
-    """An animation in front of a camera: draws its frames."""
+    """A motion in front of a camera: draws its frames."""
 
-    def __init__(self, animation: Animation, coloring: Coloring, camera: tuple[float, float] | None) -> None:
+    def __init__(self, coloring: Coloring, camera: tuple[float, float] | None) -> None:
         """Fits the view to the whole motion, which is read through for it.
 
         Args:
-            animation: the motion.
-            coloring: the colours of the bodies.
+            coloring: the motion, and the colours of the bodies.
             camera: azimuth and elevation [degrees]; ``None`` for the usual ones.
 
         Raises:
-            OutputError: a camera for a 2D animation.
+            OutputError: a camera for a 2D scene.
         """
-        self._animation, self._coloring = animation, coloring
-        self._faces = [body.surface_faces for body in animation.bodies]
-        self._flat = all(body.cells.shape[1] == 3 for body in animation.bodies)
+        self._coloring = coloring
+        self._stage = stage = coloring.stage
+        self._flat = stage.is_flat
+        counts = [len(triangles.points) for triangles in stage.triangles]
+        self._has_inside = np.repeat(stage.has_insides, counts)
         if self._flat and camera is not None:
-            raise OutputError("the animation is 2D, which has no other camera than the usual one: leave it out")
-        self._up = np.eye(3)[1 if self._flat or animation.up_axis == "Y" else 2]
-        obstacles = [Obstacle.whole(points[faces], self._flat) for points, faces in animation.obstacles]
+            raise OutputError("the scene is 2D, which has no other camera than the usual one: leave it out")
+        self._up = np.eye(3)[1 if self._flat or stage.up_axis == "Y" else 2]
+        obstacles = [Obstacle.whole(own.corners, own.is_plane, self._flat) for own in stage.standing]
         lean = sum(obstacle.normal[0] for obstacle in obstacles if obstacle.is_plane)
         if camera is None:
             azimuth, elevation = USUAL
@@ -49,8 +49,8 @@ class Scene:
         axes = np.eye(3) if self._flat else camera_axes(self._up, *camera)
         both = np.concatenate([np.eye(3), axes])  # bounds are needed in the world and in the image
         lower, upper = np.full(6, np.inf), np.full(6, -np.inf)
-        for index in range(animation.frame_count):
-            for body in animation.frame(index):
+        for index in range(stage.frame_count):
+            for body in stage.frame(index):
                 along = body.points @ both.T
                 lower, upper = np.minimum(lower, along.min(axis=0)), np.maximum(upper, along.max(axis=0))
         nearby = [obstacle.near(lower[:3], upper[:3]) for obstacle in obstacles]
@@ -61,8 +61,9 @@ class Scene:
 
     def image(self, index: int) -> np.ndarray:
         """Draws a frame: (height, width, 3) uint8."""
-        frame = self._animation.frame(index)
-        corners = np.concatenate([body.points[faces] for body, faces in zip(frame, self._faces, strict=True)])
+        frame = self._stage.frame(index)
+        pairs = zip(frame, self._stage.triangles, strict=True)
+        corners = np.concatenate([own.points[triangles.points] for own, triangles in pairs])
         values = np.concatenate(self._coloring.values(index, frame))
         colors = self._coloring.scale.srgb(values.ravel()).reshape(corners.shape)
         normals = normals_of(corners)
@@ -73,7 +74,7 @@ class Scene:
             canvas.color[covered(self.view.project(shadow), self.view) & visible] *= _SHADOW
 
         away = normals @ self.view.axes[2] < 0.0
-        colors[away], normals[away] = _INSIDE_OUT, -normals[away]
+        colors[away & self._has_inside], normals[away] = _INSIDE_OUT, -normals[away]
         samples = self.view.project(corners)
         samples[away, :, 2] -= 0.5  # along its outline one sees a body's front
         canvas.draw(samples, colors * self._shade(normals), lines=0.5 if self._flat else 0.3)

@@ -35,6 +35,8 @@ VECTORIZED_CELLS = 8192
 """Cells of a material from which on its forces are computed several cells at a time, which takes some seconds to
 compile once: the forces are a small part of an implicit step."""
 
+CROSSING = "a point goes round or through a sphere or box, which more stiffness of the obstacle may prevent"
+
 MAX_HALVINGS = 10
 """How often a step that fails is halved before it is refused."""
 
@@ -264,7 +266,7 @@ class ImplicitStepper(Stepper):
             way = potential.predicted
             potential.add_scaled(u, -1.0, state.u, way)
         if potential.crosses_an_obstacle(state.u, way):
-            report = replace(report, converged=False, rounded=False, note="a point goes round or through a sphere")
+            report = replace(report, converged=False, rounded=False, note=CROSSING)
             self._require_solved(report)
         if self._norm is not None:
             report = replace(report, error=self._estimate_error(state, dt, h))

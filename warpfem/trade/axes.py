@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +11,15 @@ from typing import Literal
 from warpfem.boundary import is_number
 from warpfem.errors import SceneError, WarpfemError
 from warpfem.scene import Scene
-from warpfem.scene_file import scene_parameters
+from warpfem.scene_file import scene_parameters, value_of
 from warpfem.solvers.implicit import ImplicitSolver
-from warpfem.trade.problem import FORCED, Problem, Setting, require_known
+from warpfem.trade.problem import FORCED, SOLVER_FIELDS, Problem, Setting, require_known
 
 Kind = Literal["space", "time", "algebra", "model"]
 
 SPACE = ("element", "refine")
 TIME = ("dt", "solver", "error")
-ALGEBRA = ("tolerance", "linear_tolerance", "dtype", "max_iterations", "linear_iterations", "linear_solver")
+ALGEBRA = ("dtype", *(name for name in SOLVER_FIELDS if name not in TIME))
 """Axes whose names say which error they bear on, if they are not parameters that change the mesh."""
 
 CLEARLY_MORE = 1.5
@@ -115,15 +114,15 @@ class MeshControl:
 
 def mesh_control(problem: Problem) -> MeshControl:
     """Finds out which parameters of the scene set its number of cells: by changing each, which takes as many builds."""
+    plain = problem.build(Setting()).scene
     given = dict(problem.parameters)
     numbers: list[tuple[str, float]] = []
     for name, parameter in scene_parameters(problem.path).items():
-        default = parameter.default
-        if name in given and is_number(default):
-            default = type(default)(float(given[name]))
-        if default is not inspect.Parameter.empty and is_number(default) and default > 0:
-            numbers.append((name, default))
-    plain = problem.build(Setting()).scene
+        value = parameter.default
+        if name in given:
+            value = value_of(problem.path, name, given[name], value)
+        if is_number(value) and value > 0:
+            numbers.append((name, value))
     for kind, factor, sign in ((int, 2, 1), (float, 0.5, -1)):
         found = tuple(
             (name, value)

@@ -8,7 +8,7 @@ Each is the difference that one change makes. Of implicit schemes:
 - model: what it changes of the problem, on the reference's coarsest mesh, against that without.
 
 Explicit steps are halved instead, which leaves a part 2^-p of their error, p being their order: what that changes is in
-time, the rest in space.
+time, the rest, that of another model too, in space.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 With explicit steps, how fine a mesh each kind of cells needs; on a coarse mesh, how long the steps of each implicit
 scheme may be, as far as it is not dearer already than what was found; and how fine a mesh those need. The share of the
-error that is left to time is that at which less of it costs the same in space and in time.
+error that is left to time is that at which less of it costs the same in space and in time. Since errors of coarse
+settings compensate, the longest steps are sought once more on the meshes that were found, where all errors count.
 """
 
 from __future__ import annotations
@@ -97,6 +98,8 @@ class Contenders:
             ]
             for base in self._by_promise(bases, goal):
                 self._add(found, base, goal)
+        for element in list(self.starts):
+            self._add_longest_steps(found, element, goal)
         found = sorted((t for t in found if t.setting not in excluded), key=lambda t: t.seconds)
         found += self._linear(found[:1], goal)
         found.sort(key=lambda t: t.seconds)
@@ -135,6 +138,31 @@ class Contenders:
             self.starts.setdefault(element, trial.setting.only(self.mesh.names))
             self.points.setdefault(element, trial.outcome.points)
 
+    def _add_longest_steps(self, found: list[Trial], element: str, goal: float) -> None:
+        """Adds, for each implicit scheme, the longest steps that are within the goal on the mesh of these cells."""
+        mesh = self.starts[element].changed(**{f"{FORCED}element": element})
+        for scheme, order in self._schemes().items():
+            most = PROMISING * _least(found)
+            coarse = self.coarse.one(self._one_step(self.coarse_mesh, scheme))
+            if coarse.seconds * self._growth(element) > most:
+                continue
+            trial = coarsest_within(
+                self.trials.one,
+                self._one_step(mesh, scheme),
+                finer_in_time(self.fps),
+                lambda own: float(steps_of(own.setting, self.fps)),
+                goal=goal,
+                order=order,
+                growth=LEAN,
+                most_seconds=min(most, self.trials.study.limit),
+            )
+            if trial is not None:
+                found.append(trial)
+
+    def _one_step(self, mesh: Setting, scheme: str) -> Setting:
+        """A step of a frame of an implicit scheme."""
+        return with_steps(mesh.changed(**{f"{FORCED}solver": scheme}), self.fps, 1)
+
     def _growth(self, element: str) -> float:
         """By how much a step costs more than on the coarse mesh, at least."""
         return (self.points.get(element, 0) / self.coarse_points) ** LEAN
@@ -143,12 +171,11 @@ class Contenders:
         """For each implicit scheme the longest steps whose error is within time's share of the goal."""
         growth = max(1.0, min(map(self._growth, self.points), default=1.0))
         most = min(PROMISING * _least(found) / growth, self.trials.study.limit)
-        return [self._time_level(scheme, goal, most) for scheme in self._schemes()]
+        return [self._time_level(scheme, order, goal, most) for scheme, order in self._schemes().items()]
 
-    def _time_level(self, scheme: str, goal: float, most_seconds: float) -> Trial | None:
-        order = 1.0 if scheme == LINEARISED else float(SOLVERS[scheme].order)
+    def _time_level(self, scheme: str, order: float, goal: float, most_seconds: float) -> Trial | None:
         share = (1.0 / order) / (1.0 / order + (self.scene.dim + 0.5) / MEAN_ORDER)
-        base = with_steps(self.coarse_mesh.changed(**{f"{FORCED}solver": scheme}), self.fps, 1)
+        base = self._one_step(self.coarse_mesh, scheme)
         first = self.coarse.one(base)
         if not first.seconds <= most_seconds and not first.point.failure:
             return None
@@ -193,11 +220,12 @@ class Contenders:
         averaged = max(nus, default=0.0) >= NEARLY_INCOMPRESSIBLE
         return ["linear", "quadratic", *(["averaged"] if averaged else [])]
 
-    def _schemes(self) -> list[str]:
-        """The implicit schemes that are tried."""
-        schemes = [LINEARISED, *(name for name, kind in SOLVERS.items() if issubclass(kind, ImplicitSolver))]
+    def _schemes(self) -> dict[str, float]:
+        """The implicit schemes that are tried, and their orders in time."""
+        schemes = {LINEARISED: 1.0}
+        schemes |= {name: float(kind.order) for name, kind in SOLVERS.items() if issubclass(kind, ImplicitSolver)}
         if self.scene.obstacles:
-            schemes.remove(ImplicitMidpoint.name)
+            del schemes[ImplicitMidpoint.name]
         return schemes
 
 

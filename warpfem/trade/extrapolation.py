@@ -38,7 +38,7 @@ class Extrapolated:
         value: the limit, or the finest level where nothing was extrapolated; of the shape of the levels.
         order: the observed order; ``None`` if there is none to be trusted.
         band: bound of what the limit is off by, a root mean square over the vectors of a field.
-        largest_band: the same bound for the largest vector of a field; of a number the same as ``band``.
+        largest_band: the same for the largest vector of a field, of whose correction no part is claimed.
         remark: why nothing was extrapolated; empty if something was.
     """
 
@@ -66,10 +66,7 @@ def extrapolate(levels: Sequence[np.ndarray], sizes: Sequence[float]) -> Extrapo
     a = rest[0]
     first = _rms(b - a)
     if not last < first:
-        worst = max(first, last) / last
-        return Extrapolated(
-            c, None, worst * last, worst * largest, f"it does not converge: changes of {first:.2e} and then {last:.2e}"
-        )
+        return Extrapolated(c, None, last, largest, f"it does not converge: changes of {first:.2e} and then {last:.2e}")
     h = [float(size) for size in sizes[-3:]]
     if float(((b - a) * (c - b)).sum()) < ALIGNED * np.sqrt(((b - a) ** 2).sum() * ((c - b) ** 2).sum()):
         return Extrapolated(c, None, last, largest, "the changes shrink, but do not go the same way")

@@ -108,24 +108,26 @@ class Answer:
             return f"No answer for {asked}: {self.refusal}"
         price = "what that would cost, the front does not tell"
         if self.next_seconds is not None:
-            seconds = f"{self.next_seconds:.2g} s"
-            price = f"{'about ' if self.next_how == 'extrapolated' else ''}{seconds} ({self.next_how})"
+            price = (
+                f"{'about ' if self.next_how == 'extrapolated' else ''}{rounded(self.next_seconds)} s ({self.next_how})"
+            )
         if self.candidate is None:
             assert self.closest is not None
             return (
                 f"No setting of the sweep is within {asked}: the most accurate, {self.closest.point.setting.label}, is "
                 f"off by {percent(self.closest.error)} (± {percent(self.closest.band)}) and takes "
-                f"{self.closest.seconds:.2g} s; to get there: {price}"
+                f"{rounded(self.closest.seconds)} s; to get there: {price}"
             )
         own = self.candidate
         least, most = own.point.spread
         if self.next_seconds == own.seconds:
             price = "it is within that, too"
         elif self.next_seconds is not None:
-            price += f", {self.next_seconds / own.seconds:.2g} times as much"
+            price += f", {rounded(self.next_seconds / own.seconds)} times as much"
         return (
-            f"The cheapest setting within {asked} is {own.point.setting.label}: {own.seconds:.2g} s ({least:.2g} to "
-            f"{most:.2g} s), off by {percent(own.error)} (± {percent(own.band)}); the next factor of {NEXT:g}: {price}"
+            f"The cheapest setting within {asked} is {own.point.setting.label}: {rounded(own.seconds)} s "
+            f"({rounded(least)} to {rounded(most)} s), off by {percent(own.error)} (± {percent(own.band)}); "
+            f"the next factor of {NEXT:g}: {price}"
         )
 
 
@@ -169,7 +171,15 @@ def advice(reference: Reference, name: str) -> str:
 
 
 def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
-    """The time at which the front, continued as a power law from its last part, comes to an error [s]."""
+    """The time at which the front, continued as a power law from its last part, comes to an error [s].
+
+    ``None`` if the front does not tell: errors that the reference does not resolve follow no power law, and where one
+    of them may be within the goal, others need not be looked for beyond.
+    """
+    resolved = [own for own in edge if own.resolved]
+    if not resolved or edge[-1].error <= goal:
+        return None
+    edge = resolved
     tail = [own for own in edge if own.error <= TAIL * edge[-1].error]
     tail = tail if len(tail) >= LEAST_TAIL else list(edge[-LEAST_TAIL:])
     if len(tail) < 2:
@@ -183,7 +193,12 @@ def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
 
 def percent(value: float) -> str:
     """A relative error for people."""
-    return f"{100.0 * value:.0f} %" if value >= 0.995 else f"{100.0 * value:.2g} %"
+    return f"{rounded(100.0 * value)} %"
+
+
+def rounded(value: float) -> str:
+    """A number for people, to two digits but never without its units."""
+    return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
 
 
 def label(name: str) -> str:

@@ -15,7 +15,7 @@ from warpfem.errors import SceneError, SimulationError, WarpfemError, described
 from warpfem.motion import Motion
 from warpfem.simulation import Simulation, Summary
 from warpfem.threads import available_threads
-from warpfem.trade.machine import facts, peak_bytes
+from warpfem.trade.machine import peak_bytes
 from warpfem.trade.outcome import Order, Outcome
 from warpfem.trade.problem import Choice, mesh_size
 
@@ -25,7 +25,7 @@ LONG = 0.5
 
 def measure(order: Order) -> Outcome:
     """Runs a setting, once or until its rounds together are long enough to be timed."""
-    outcome = Outcome(load=order.load, machine=facts())
+    outcome = Outcome(load=order.load)
     wp.config.log_level = wp.LOG_ERROR
     try:
         with warnings.catch_warnings():
@@ -41,7 +41,9 @@ def measure(order: Order) -> Outcome:
 
 def _measure(order: Order, outcome: Outcome) -> None:
     problem = order.problem
+    outcome.by_chance = True
     problem.require_same_file()
+    outcome.by_chance = False  # what fails from here on fails again
     choice = problem.build(order.setting)
     threads = order.threads or available_threads()
     with _kernel_seconds() as seconds:

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from warpfem.trade.machine import facts
 from warpfem.trade.problem import Problem, Setting
 
 Load = Literal["serial", "parallel"]
@@ -44,7 +45,8 @@ class Outcome:
         failure: why there is no result; empty if there is one.
         load: whether other runs of the study ran at the same time.
         limit: the wall time that was not enough, if that is why [s].
-        by_chance: whether the failure is one of the machine, such as a process that was killed.
+        by_chance: whether the failure is none of the setting's, such as a process that was killed, or a scene file
+            that was not there or had been edited meanwhile.
         seconds: wall time of the steps of each round [s].
         setup_seconds: wall time to build the model, without its kernels [s].
         kernel_seconds: wall time to compile kernels, or to load those compiled before [s].
@@ -58,7 +60,7 @@ class Outcome:
         linear_solver: what solved the linear systems, and why.
         quantities: the scene's quantities of interest by name.
         missing: why some of them have no value, by name.
-        machine: facts of the machine and versions.
+        machine: facts of the machine and versions: of this one, unless another is named.
         times: simulated time of the frames (frames,) [s].
         motion: displacements at the places (frames, places, dim) [m].
     """
@@ -84,6 +86,6 @@ class Outcome:
     linear_solver: str = ""
     quantities: dict[str, float] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
-    machine: dict[str, Any] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=facts)
     times: np.ndarray = field(default_factory=lambda: np.zeros(0))
     motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))

@@ -33,13 +33,18 @@ def plot(own: Sweep, folder: Path) -> list[Path]:
     upper, lower = figure.subplots(2, 1, height_ratios=(2.6, 1.0))
     _draw(upper, own)
     _list(lower, own)
-    paths = [folder / "trade.png", folder / "trade.svg"]
+    paths = plots(folder)
     try:
         for path in paths:
             figure.savefig(path, dpi=150)
     except OSError as error:
         raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from None
     return paths
+
+
+def plots(folder: Path) -> list[Path]:
+    """The files that :func:`plot` draws."""
+    return [folder / "trade.png", folder / "trade.svg"]
 
 
 def _draw(axes: Any, own: Sweep) -> None:

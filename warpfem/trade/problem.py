@@ -158,7 +158,8 @@ class Problem:
         """
         own = self.parameter_names()
         if setting.get("dt") == "auto" and "dt" in own:  # where the parameter is a number
-            return self.build(setting.changed(dt=None).changed(**{f"{FORCED}dt": "auto"}))
+            forced = {f"{FORCED}dt": setting.get(f"{FORCED}dt", "auto")}
+            return self.build(setting.changed(dt=None).changed(**forced))
         given = dict(self.parameters) | {name: _literal(name, value) for name, value in setting if name in own}
         scene = load_scene(self.path, given)
         rest = {name: value for name, value in setting if name not in own and not name.startswith(FORCED)}
@@ -177,7 +178,7 @@ class Problem:
 
     def applicable(self, setting: Setting) -> Setting:
         """The setting without what its solver does not have, such as the tolerance of explicit steps."""
-        solver_fields = _SOLVER_FIELDS - set(self.parameter_names())
+        solver_fields = SOLVER_FIELDS - set(self.parameter_names())
         asked = [name for name, _ in setting if name in solver_fields]
         if not asked:
             return setting
@@ -188,7 +189,7 @@ class Problem:
 
 def known_names(parameters: Sequence[str]) -> list[str]:
     """What axes of a scene with these parameters can be called."""
-    return [*parameters, *(name for name in [*_CHANGES, "dtype", *sorted(_SOLVER_FIELDS)] if name not in parameters)]
+    return [*parameters, *(name for name in [*_CHANGES, "dtype", *sorted(SOLVER_FIELDS)] if name not in parameters)]
 
 
 def require_known(name: str, parameters: Sequence[str]) -> None:
@@ -291,7 +292,8 @@ _CHANGES = {
 }
 """What changes a scene that is no parameter of it, in the order in which it is done."""
 
-_SOLVER_FIELDS = {field.name for kind in SOLVERS.values() for field in fields(kind)}  # type: ignore[arg-type]
+SOLVER_FIELDS = {field.name for kind in SOLVERS.values() for field in fields(kind)}  # type: ignore[arg-type]
+"""Names of the settings of solvers."""
 
 
 def _with_field(solver: Solver, name: str, text: str) -> Solver:

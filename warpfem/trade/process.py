@@ -11,7 +11,6 @@ import sys
 import tempfile
 import threading
 
-from warpfem.trade.machine import facts
 from warpfem.trade.outcome import Order, Outcome
 from warpfem.trade.worker import LENGTH
 
@@ -55,7 +54,7 @@ def _attempt(order: Order) -> tuple[Outcome, bool]:
             )
         except OSError as problem:
             why = f"no process could be started: {problem}"
-            return Outcome(why, order.load, by_chance=True, machine=facts()), False
+            return Outcome(why, order.load, by_chance=True), False
         _running.add(process)
         late = threading.Event()
 
@@ -90,8 +89,8 @@ def _attempt(order: Order) -> tuple[Outcome, bool]:
         told = errors.read().decode(errors="replace").strip().splitlines()
     if late.is_set():
         why = f"out of time: more than {order.seconds:.0f} s"
-        return Outcome(why, order.load, limit=order.seconds, machine=facts()), False
+        return Outcome(why, order.load, limit=order.seconds), False
     killed = status == -signal.SIGKILL
     why = f"was killed by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
     hint = " (out of memory?)" if killed else f": {told[-1]}" if told else ""
-    return Outcome(f"the process {why}{hint}", order.load, by_chance=killed, machine=facts()), killed and not ended
+    return Outcome(f"the process {why}{hint}", order.load, by_chance=killed), killed and not ended

@@ -105,7 +105,7 @@ def build_reference(
         explicit: whether its runs take explicit steps; ``None`` as the scene does.
 
     Raises:
-        SimulationError: no ladder of two levels could be run, or the quantity has no value.
+        SimulationError: no ladder of two levels could be run, or the quantity has no value, or that of 0.
     """
     if explicit is None:
         explicit = not isinstance(study.scene.solver, ImplicitSolver)
@@ -137,6 +137,8 @@ class _Builder:
             parts = reference.parts.get(name)
             if parts is None:
                 raise SimulationError(f"the reference has no value of '{name}': it has {', '.join(reference.names)}")
+            if not reference.scales[name] > 0.0:
+                raise SimulationError(f"the reference has 0 for '{name}': no error is relative to that")
             best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
             need = max(best, least) / MARGIN if within is None else within
             growths = {"space": self._grow_mesh}
@@ -171,11 +173,15 @@ class _Builder:
             raise SimulationError("there is no reference: " + "; ".join(self.remarks))
 
     def _first_steps(self) -> list[int]:
-        """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh."""
+        """Steps of a frame of the first ladder in time; 0 for explicit schemes, whose steps are those of the mesh.
+
+        They are as short as those of the implicit settings: explicit ones are shorter than their errors in time want.
+        """
         if not self.implicit:
             return [0]
         interval = 1.0 / self.study.scene.fps
-        shortest = min((p.first.shortest_dt for p in self.asked if p.first.shortest_dt > 0.0), default=interval)
+        implicit = [point.first for point in self.asked if point.first.newton_iterations > 0]
+        shortest = min((outcome.longest_dt for outcome in implicit), default=interval)
         most = max(4, 2 ** math.ceil(math.log2(max(1.0, interval / shortest) - 1e-6)))
         return [most // 4, most // 2, most]
 

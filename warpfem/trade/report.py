@@ -201,11 +201,14 @@ def _finite(value: Any) -> Any:
 
 
 def rows(own: Sweep) -> list[dict[str, Any]]:
-    """A row of plain values for each setting, as CSV has it."""
+    """A row of plain values for each setting, as CSV has it.
+
+    An axis can be called as a measured number is, such as ``cells``: its column is ``axis_cells``.
+    """
     table = []
     for record in data(own)["settings"]:
-        row = {**{axis.name: record["setting"].get(axis.name, "") for axis in own.axes}, "failure": record["failure"]}
-        row |= {"load": own.study.load, "on_front": record["on_front"]}
+        row = {f"axis_{axis.name}": record["setting"].get(axis.name, "") for axis in own.axes}
+        row |= {"failure": record["failure"], "load": own.study.load, "on_front": record["on_front"]}
         for name, value in record.items():
             if name in ("errors", "quantities"):
                 row |= {f"{name.rstrip('s') if name == 'errors' else 'value'}_{key}": own for key, own in value.items()}

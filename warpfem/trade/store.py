@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from warpfem.errors import OutputError
-from warpfem.files import replacing
+from warpfem.files import replacing, save_arrays
 from warpfem.trade.outcome import Outcome
 from warpfem.trade.problem import Problem, Setting
 
@@ -20,7 +21,8 @@ class Store:
     """The outcomes of a study, in a folder.
 
     ``runs.jsonl`` has a line for each, and ``motions/KEY.npy`` the recorded motion of each setting, that of its first
-    run without failure: all its runs have the same.
+    run without failure: all its runs have the same. ``places/KEY.npz`` has the places of each scene at which it was
+    recorded.
 
     Args:
         folder: is made if it does not exist.
@@ -34,14 +36,29 @@ class Store:
         self._lines = folder / "runs.jsonl"
         self._outcomes: dict[str, list[Outcome]] = {}
         try:
-            (folder / "motions").mkdir(parents=True, exist_ok=True)
+            for name in ("motions", "places"):
+                (folder / name).mkdir(parents=True, exist_ok=True)
             self._read()
         except OSError as error:
             raise OutputError(f"cannot use the folder {folder}: {error.strerror or error}") from None
 
     def outcomes(self, problem: Problem, setting: Setting) -> list[Outcome]:
-        """All outcomes of a setting, in the order in which they came."""
-        return list(self._outcomes.get(problem.key(setting), ()))
+        """All outcomes of a setting, in the order in which they came.
+
+        Raises:
+            OutputError: their motion cannot be read.
+        """
+        key = problem.key(setting)
+        own = self._outcomes.get(key, [])
+        good = [outcome for outcome in own if not outcome.failure]
+        if any(not outcome.motion.size for outcome in good):
+            try:  # one file remains open for each setting, and none for those that are not asked for
+                motion = np.load(self._motion(key), mmap_mode="r")
+            except OSError as error:
+                raise OutputError(f"cannot read {self._motion(key)}: {error.strerror or error}") from None
+            for outcome in good:
+                outcome.motion = motion
+        return list(own)
 
     def add(self, problem: Problem, setting: Setting, outcome: Outcome) -> None:
         """Keeps an outcome.
@@ -55,7 +72,8 @@ class Store:
             if not outcome.failure and not motion.exists():
                 with replacing(motion) as temporary, open(temporary, "wb") as array:
                     np.save(array, outcome.motion)
-            record = asdict(replace(outcome, motion=np.zeros(0))) | {"times": outcome.times.tolist()}
+            kept = replace(outcome, motion=np.zeros((0, 0, 0)))  # read when it is asked for
+            record = asdict(kept) | {"times": outcome.times.tolist()}
             del record["motion"]
             line = json.dumps({"key": key, "setting": dict(setting), **record}) + "\n"
             file = os.open(self._lines, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -64,11 +82,31 @@ class Store:
                 os.fsync(file)
             finally:
                 os.close(file)
-            if not outcome.failure:
-                outcome.motion = np.load(motion, mmap_mode="r")
         except OSError as error:
             raise OutputError(f"cannot write to {self.folder}: {error.strerror or error}") from None
-        self._outcomes.setdefault(key, []).append(outcome)
+        self._outcomes.setdefault(key, []).append(kept)
+
+    def places(self, problem: Problem, drawn: Callable[[], list[np.ndarray]]) -> list[np.ndarray]:
+        """The places at which all motions of a scene are recorded, those of fewer frames too.
+
+        They are kept: some meshes come out different each time that they are made, and so would the places.
+
+        Args:
+            problem: the scene and its parameters.
+            drawn: gives them for each body, if there are none yet.
+
+        Raises:
+            OutputError: they cannot be read or written.
+        """
+        key = replace(problem, frames=None, device=None).key(Setting())
+        path = self.folder / "places" / f"{key}.npz"
+        try:
+            if not path.exists():
+                save_arrays(path, {f"body_{index}": own for index, own in enumerate(drawn())})
+            with np.load(path) as arrays:
+                return [arrays[f"body_{index}"] for index in range(len(arrays.files))]
+        except OSError as error:
+            raise OutputError(f"cannot use {path}: {error.strerror or error}") from None
 
     def _motion(self, key: str) -> Path:
         return self.folder / "motions" / f"{key}.npy"
@@ -87,8 +125,6 @@ class Store:
             key = record.get("key", "")
             outcome = Outcome(**{name: value for name, value in record.items() if name in known})
             outcome.times = np.array(outcome.times)
-            if not outcome.failure:
-                if not self._motion(key).exists():
-                    continue  # somebody removed it: run it again
-                outcome.motion = np.load(self._motion(key), mmap_mode="r")
+            if not outcome.failure and not self._motion(key).exists():
+                continue  # somebody removed it: run it again
             self._outcomes.setdefault(key, []).append(outcome)

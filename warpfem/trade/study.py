@@ -12,6 +12,7 @@ import numpy as np
 
 from warpfem.errors import OutputError, described
 from warpfem.places import spread_places
+from warpfem.trade.machine import facts
 from warpfem.trade.outcome import Load, Order, Outcome
 from warpfem.trade.problem import Problem, Setting
 from warpfem.trade.process import run_order
@@ -112,12 +113,19 @@ class Study:
         self.threads = threads
         self.say = say
         self._executor = executor
+        self._machine = facts()
+        self._given_up: set[Setting] = set()
         self.scene = problem.build(Setting()).scene
+        self.places = store.places(problem, self._spread)
+
+    def _spread(self) -> list[np.ndarray]:
         share = max(1, PLACES // len(self.scene.bodies))
-        self.places = [spread_places(body.mesh, share) for body in self.scene.bodies]
+        return [spread_places(body.mesh, share) for body in self.scene.bodies]
 
     def shortened(self, frames: int) -> Study:
         """The same study of the first frames alone."""
+        if frames == self.scene.frames:
+            return self  # its outcomes are those of all frames
         return self._like(replace(self.problem, frames=frames), self.load, self.threads)
 
     def alone(self) -> Study:
@@ -130,7 +138,7 @@ class Study:
     def run(self, settings: Sequence[Setting], repeats: int = 1) -> list[Point]:
         """Runs settings, round after round, so that slow changes of the machine's speed show in the spread.
 
-        Outcomes that the store has, of the same load, are not run again.
+        Outcomes that the store has, of the same load and machine, are not run again.
 
         Args:
             settings: the settings.
@@ -147,7 +155,7 @@ class Study:
         return [Point(setting, tuple(self._own(setting))) for setting in settings]
 
     def solve(self, settings: Sequence[Setting]) -> list[Point]:
-        """As :meth:`run`, once, for the motion alone: an outcome of any load will do."""
+        """As :meth:`run`, once, for the motion alone: an outcome of any load and machine will do."""
         known = {s: [o for o in self.store.outcomes(self.problem, s) if not o.failure] for s in settings}
         self._run_missing([setting for setting, outcomes in known.items() if not outcomes], 1, 1)
         return [Point(s, tuple(known[s] or self._own(s))) for s in settings]
@@ -157,18 +165,24 @@ class Study:
         missing = [setting for setting in dict.fromkeys(settings) if self._lacks(setting, count)]
         for setting, outcome in self._run_each(missing, rounds):
             self.store.add(self.problem, setting, outcome)
+            if outcome.by_chance:
+                self._given_up.add(setting)  # until the study is taken up again
             told = outcome.failure or f"{statistics.median(outcome.seconds):.3g} s of steps"
             self.say(f"{setting.label}: {told}")
 
     def _own(self, setting: Setting) -> list[Outcome]:
-        """The outcomes that count for a setting: those of the study's load."""
-        return [o for o in self.store.outcomes(self.problem, setting) if o.load == self.load]
+        """The outcomes that count for a setting: those of the study's load, and of this machine if it is serial."""
+        own = [o for o in self.store.outcomes(self.problem, setting) if o.load == self.load]
+        return own if self.load == "parallel" else [o for o in own if self._is_of_this_machine(o)]
+
+    def _is_of_this_machine(self, outcome: Outcome) -> bool:
+        return all(outcome.machine.get(name) == self._machine[name] for name in ("processor", "cores"))
 
     def _lacks(self, setting: Setting, count: int) -> bool:
         own = self._own(setting)
         good = sum(not outcome.failure for outcome in own)
         for_good = [o for o in own if o.failure and not o.by_chance and not 0.0 < o.limit < self.limit]
-        return good < count and not for_good
+        return good < count and not for_good and setting not in self._given_up
 
     def _run_each(self, settings: Sequence[Setting], rounds: int) -> Iterator[tuple[Setting, Outcome]]:
         """Outcomes as they come; what a lost worker had in hand is submitted again."""
@@ -177,7 +191,7 @@ class Study:
             for setting in settings
         }
         futures: dict[Future[Outcome], tuple[Setting, int]] = {
-            self._executor.submit(run_order, order): (setting, 1) for setting, order in orders.items()
+            self._submit(order): (setting, 1) for setting, order in orders.items()
         }
         while futures:
             done, _ = wait(futures, return_when=FIRST_COMPLETED)
@@ -192,9 +206,18 @@ class Study:
                             "came before is kept, and the same command goes on"
                         ) from None
                     self.say(f"{setting.label}: a worker was lost ({described(error)}), submitted again")
-                    futures[self._executor.submit(run_order, orders[setting])] = setting, submitted + 1
+                    futures[self._submit(orders[setting])] = setting, submitted + 1
                     continue
                 yield setting, outcome
+
+    def _submit(self, order: Order) -> Future[Outcome]:
+        """What comes of an order; an executor that takes none, as when its cluster is gone, has lost it."""
+        try:
+            return self._executor.submit(run_order, order)
+        except Exception as error:
+            lost: Future[Outcome] = Future()
+            lost.set_exception(error)
+            return lost
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,12 @@ class Sweep:
 
 
 def require_quantity(problem: Problem, name: str) -> None:
-    """Raises SceneError unless a name is that of a norm or a quantity of the scene."""
-    known = [L2, LARGEST, *problem.build(Setting()).scene.quantities]
+    """Raises SceneError unless a name is that of a norm or a quantity of the scene, and not of both."""
+    quantities = problem.build(Setting()).scene.quantities
+    for norm in (L2, LARGEST):
+        if norm in quantities:
+            raise SceneError(f"a quantity cannot be called '{norm}': that is a norm of the motion")
+    known = [L2, LARGEST, *quantities]
     if name not in known:
         raise SceneError(f"there is no quantity '{name}': the scene has {', '.join(map(repr, known))}")
 

@@ -114,7 +114,7 @@ def tune(study: Study, mesh: MeshControl, name: str, target: float, *, repeats: 
         Rung(first.setting, first.size, _part(coarse, slice(frames + 1))),
     )
     whole = Trials(study, reference.outcome, reference.scales, name)
-    limit = target - reference.band(name)
+    limit = _limit(name, target, reference.band(name))
     holding, ended = _search(contenders, whole, limit, frames)
     if not holding:
         raise SimulationError(
@@ -148,6 +148,15 @@ def tune(study: Study, mesh: MeshControl, name: str, target: float, *, repeats: 
         sorted(ended, key=lambda trial: trial.seconds),
         len(contenders.tried | whole.tried),
     )
+
+
+def _limit(name: str, target: float, band: float) -> float:
+    """The largest error against the reference of what is taken to be within the target.
+
+    In the root mean square, errors of the setting and of the reference, which have nothing to do with each other, add
+    up as squares do.
+    """
+    return math.sqrt(target**2 - band**2) if name == L2 else target - band
 
 
 def _part(outcome: Outcome, frames: slice) -> Outcome:

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from warpfem.trade.front import label, percent
+from warpfem.trade.front import label, percent, rounded
 from warpfem.trade.machine import facts
 from warpfem.trade.problem import FORCED, Setting
 from warpfem.trade.reference import Reference
@@ -21,7 +21,7 @@ def sentence(own: Tuned) -> str:
     least, most = own.point.spread
     return (
         f"The cheapest setting found within {percent(own.target)} of {label(own.name)} is {_label(own.setting)}: "
-        f"{own.point.seconds:.2g} s of steps ({least:.2g} to {most:.2g} s), off by {percent(own.error)} "
+        f"{rounded(own.point.seconds)} s of steps ({rounded(least)} to {rounded(most)} s), off by {percent(own.error)} "
         f"(± {percent(own.band)})"
     )
 

@@ -13,7 +13,7 @@ from warpfem.errors import MeshError, OutputError
 from warpfem.usd.colors import ColorScale
 from warpfem.usd.meshes import triangles_of
 from warpfem.usd.prims import CELL_PRIMVARS, OBSTACLES, POINT_PRIMVARS, TETS, WORLD, surface_name
-from warpfem.usd.stages import is_trusted, open_stage, reporting, trust, world_matrix
+from warpfem.usd.stages import is_trusted, open_stage, read_attributes, reporting, trust, world_matrix
 
 LARGEST = 1e30
 """Coordinates above this are no lengths [m]: what is computed of them would overflow."""
@@ -60,9 +60,7 @@ class Animation:
         fps: frames per second.
         frame_count: the number of frames.
         up_axis: ``"Y"`` or ``"Z"``.
-        equilibria: whether frames are equilibria on the way to the full load, and not moments in time.
         scale: the quantity that colours show, with its range.
-        primvars: names of the scalar primvars that every body's surface has.
         bodies: what never changes, per body.
         obstacles: world points (n, 3) float64 [m] and triangles (k, 3) int32 of each obstacle.
     """
@@ -90,23 +88,15 @@ class Animation:
                 self.scale.quantity in POINT_PRIMVARS and -LARGEST < self.scale.lower < self.scale.upper < LARGEST,
                 "a range of colours",
             )
-            self.equilibria = bool(stated.get("equilibria"))
-            self._prims = [surface.GetParent().GetChild(TETS) or surface for surface in surfaces]
             self._surfaces = surfaces
+            self._prims = [surface.GetParent().GetChild(TETS) or surface for surface in surfaces]
             self._matrices = [world_matrix(prim) for prim in self._prims]
             times = [UsdGeom.PointBased(prim).GetPointsAttr().GetTimeSamples() for prim in self._prims]
             self.frame_count: int = len(times[0])
             self._require(all(t == list(range(self.frame_count)) for t in times), "the same frames for each body")
             self.bodies = tuple(self._body(index) for index in range(len(self._prims)))
-            scalars = [{var.GetPrimvarName() for var in _primvars(surface) if _is_scalar(var)} for surface in surfaces]
-            self.primvars = tuple(sorted(set.intersection(*scalars)))
             obstacles = stage.GetPrimAtPath(WORLD.AppendChild(OBSTACLES))
             self.obstacles = tuple(self._obstacle(prim) for prim in (obstacles.GetChildren() if obstacles else []))
-
-    @property
-    def color_primvar(self) -> str:
-        """The primvar that colours show."""
-        return POINT_PRIMVARS[self.scale.quantity]
 
     def frame(self, index: int) -> list[AnimatedFrame]:
         """Reads a frame: one entry per body.
@@ -120,27 +110,10 @@ class Animation:
         with reporting(f"frame {index} cannot be read", OutputError):
             return [self._frame(body, index) for body in range(len(self._prims))]
 
-    def surface_values(self, primvar: str, index: int) -> list[np.ndarray]:
-        """Reads a primvar of the bodies' surfaces in a frame.
-
-        Args:
-            primvar: one of :attr:`primvars`, of any interpolation.
-            index: the frame.
-
-        Returns:
-            Per body (k, 3) float64 values at the corners of its ``surface_faces``.
-
-        Raises:
-            OutputError: the values do not fit the surface, or are not finite.
-        """
-        with reporting(f"frame {index} cannot be read", OutputError):
-            return [self._corner_values(body, primvar, index) for body in range(len(self._surfaces))]
-
     def read_surfaces(self, index: int) -> None:
-        """Reads all primvars of the surfaces in a frame, to see whether the USD library bears it."""
+        """Reads what viewers show in a frame, to see whether the USD library bears it."""
         for surface in self._surfaces:
-            for primvar in _primvars(surface):
-                primvar.ComputeFlattened(index)
+            read_attributes(surface, index)
 
     def layers(self) -> list[str]:
         """The files that have been read from."""
@@ -183,26 +156,6 @@ class Animation:
             jacobian=primvar(CELL_PRIMVARS["jacobian"], cell_count),
         )
 
-    def _corner_values(self, body: int, name: str, index: int) -> np.ndarray:
-        surface, faces = self._surfaces[body], self.bodies[body].surface_faces
-        primvar = UsdGeom.PrimvarsAPI(surface).GetPrimvar(name)
-        values = np.array(primvar.ComputeFlattened(index))
-        what = f"{primvar.GetName()} of {surface.GetPath()} at {index}, one number for each of its elements"
-        self._require(values.dtype.kind in "fiu" and values.size > 0 and bool(np.isfinite(values).all()), what)
-        values = values.reshape(-1).astype(np.float64)
-        interpolation = primvar.GetInterpolation()
-        if interpolation == UsdGeom.Tokens.constant:
-            return np.full(faces.shape, values[0])
-        if interpolation == UsdGeom.Tokens.uniform:
-            self._require(len(values) == len(faces), what)
-            return np.repeat(values[:, None], 3, axis=1)
-        if interpolation == UsdGeom.Tokens.faceVarying:
-            self._require(len(values) == faces.size, what)
-            return values.reshape(faces.shape)
-        own = self._indices(surface, UsdGeom.Mesh(surface).GetFaceVertexIndicesAttr(), 3, faces.max() + 1)
-        self._require(own.shape == faces.shape and own.max() < len(values), what)
-        return values[own]
-
     def _points(self, body: int, time: float | Usd.TimeCode) -> np.ndarray:
         prim = self._prims[body]
         shape = (len(self.bodies[body].rest_points) if hasattr(self, "bodies") else None, 3)
@@ -227,14 +180,6 @@ class Animation:
         good = value.dtype.kind == "i" and value.size % corners == 0 and 0 <= value.min() <= value.max() < point_count
         self._require(bool(good), f"indices in {attribute.GetName()} of {prim.GetPath()}")
         return value.reshape(-1, corners)
-
-
-def _primvars(prim: Usd.Prim) -> list[UsdGeom.Primvar]:
-    return UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
-
-
-def _is_scalar(primvar: UsdGeom.Primvar) -> bool:
-    return str(primvar.GetTypeName().scalarType) in ("half", "float", "double", "int", "uint", "int64", "uint64")
 
 
 def read_animation(path: str | Path) -> Animation:

@@ -65,7 +65,9 @@ def solid_or_surface(path: str) -> Solid | Surface:
             return _surface(stage, path)
         if len(prims) > 1:
             found = ", ".join(str(prim.GetPath()) for prim in prims)
-            raise MeshError(f"{path}: there must be one TetMesh in the file, found: {found}")
+            raise MeshError(
+                f"{path}: there must be one TetMesh in the file, found: {found}; read_stage takes each as a body"
+            )
         mesh = UsdGeom.TetMesh(prims[0])
         cells = np.array(at_rest(mesh.GetTetVertexIndicesAttr()) or [], np.int32).reshape(-1, 4)
         points, mirrored = _world_points(mesh)

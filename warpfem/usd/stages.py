@@ -76,6 +76,12 @@ def at_rest(attribute: Usd.Attribute) -> Any:
     return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
 
 
+def read_attributes(prim: Usd.Prim, time: float) -> None:
+    """Reads all that is written of a prim at a time, to see whether the USD library bears it."""
+    for attribute in prim.GetAuthoredAttributes():
+        attribute.Get(time)
+
+
 def stated_up_axis(stage: Usd.Stage) -> Literal["Y", "Z"] | None:
     """The axis that points up, if the file states it."""
     if not stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis):
@@ -89,8 +95,14 @@ def metres_per_unit(stage: Usd.Stage) -> float:
     return UsdGeom.GetStageMetersPerUnit(stage) if stated else 1.0
 
 
-def world_matrix(prim: Usd.Prim) -> np.ndarray:
-    """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres."""
-    matrix = np.array(UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim))
+def world_matrix(prim: Usd.Prim, time: float | Usd.TimeCode | None = None) -> np.ndarray:
+    """The (4, 4) float64 matrix that takes row vectors from the prim to the world, in metres.
+
+    Args:
+        prim: the prim.
+        time: when; ``None`` for the earliest time.
+    """
+    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime() if time is None else time)
+    matrix = np.array(cache.GetLocalToWorldTransform(prim))
     matrix[:, :3] *= metres_per_unit(prim.GetStage())
     return matrix
