@@ -86,6 +86,8 @@ def main() -> None:
             done = subprocess.run([sys.executable, "-m", "warpfem", *study.command(), "--out", str(own)])
             if done.returncode not in (0, 1):  # 1: there is no answer for some of the errors
                 sys.exit(done.returncode)
+            if not (own / "trade.png").exists():
+                sys.exit(f"{study.name}: the study has no plot: without a reference, or without the extra 'plot'")
             for name in ("trade.json", "trade.csv", "trade.png"):
                 shutil.copy(own / name, plots / f"{study.name}{Path(name).suffix}")
     results = {s.name: json.loads(path.read_text()) for s in STUDIES if (path := plots / f"{s.name}.json").exists()}

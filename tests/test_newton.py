@@ -161,16 +161,19 @@ def test_velocities_given_by_others_are_taken_over():
     np.testing.assert_allclose(state.particle_qd.numpy()[:, 0], 1.0, rtol=1e-5)
 
 
-def test_planes_and_spheres_are_obstacles():
+def test_planes_spheres_and_boxes_are_obstacles():
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
     add(builder, BLOCK)
     builder.add_ground_plane(height=0.3)
     builder.add_shape_sphere(-1, xform=wp.transform((5.0, 0.0, 0.0), wp.quat_identity()), radius=0.5)
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.5)
+    builder.add_shape_box(-1, xform=wp.transform((-5.0, 0.0, 0.0), turn), hx=0.1, hy=0.2, hz=0.3)
     model = finalized(builder)
     solver = SolverWarpfem(model)
-    plane, sphere = solver.solid.scene.obstacles
+    plane, sphere, box = solver.solid.scene.obstacles
     assert plane.point == pytest.approx((0.0, 0.3, 0.0)) and plane.normal == pytest.approx((0.0, 1.0, 0.0), abs=1e-6)
     assert sphere.center == pytest.approx((5.0, 0.0, 0.0)) and sphere.radius == 0.5
+    assert box.size == pytest.approx((0.2, 0.4, 0.6)) and box.axes[0] == pytest.approx((np.cos(0.5), np.sin(0.5), 0.0))
     mu = builder.default_shape_cfg.mu
     assert plane.friction == pytest.approx(np.sqrt(model.soft_contact_mu * mu))
     state = run(solver, model, dt=1 / 24, steps=36)

@@ -142,3 +142,11 @@ def test_a_refined_body_is_the_same_solid(dim, element):
     assert (held[0] == 0.0).all()
     assert (held[1] == 0.0).all()
     assert len(held[0]) == len(held[1])
+
+
+def test_places_are_found_among_cells_of_very_different_sizes_and_far_apart():
+    small = wf.Mesh.box((1e-3, 1e-3, 1e-3), (1, 1, 1))
+    large = wf.Mesh.box((1e4, 1e4, 1e4), (1, 1, 1), (1e9, 1e9, 1e9))
+    mesh = wf.Mesh(np.concatenate([small.points, large.points]), np.concatenate([small.cells, large.cells + 8]))
+    places = mesh.points[mesh.cells].mean(axis=1)
+    np.testing.assert_array_equal(locate(mesh, places).cells, mesh.cells)

@@ -337,6 +337,17 @@ def test_the_camera_and_the_elevation_count_from_the_side_that_z_up_has_in_front
     assert down < -20 and abs(across) < 1
 
 
+@pytest.mark.parametrize(("normal", "below"), [((0, 1, 0), True), ((0, -1, 0), False)])
+def test_a_floor_that_is_seen_from_its_side_is_a_band(tmp_path: Path, normal, below: bool) -> None:
+    path = write(tmp_path / "run.usdc", 3, 1, obstacles=[Plane((0, -0.05 if below else 1.05, 0), normal)])
+    (sheet,), _ = pictures(preview(path, tmp_path / "sheet.png", camera="front"))
+    band = drawn(sheet) & ~colored(sheet)[24:-8, 8:-8]
+    body = np.argwhere(colored(sheet)[24:-8, 8:-8])
+    rows = np.flatnonzero(band.mean(axis=1) > 0.8)
+    assert 3 <= len(rows) <= 5
+    assert (rows > body[:, 0].max()).all() if below else (rows < body[:, 0].min()).all()
+
+
 @pytest.mark.parametrize("camera", ["side", "", "30", "30,20,10", "30,91", "nan,0", "inf,0", "a,b"])
 def test_unknown_cameras_are_refused(tmp_path: Path, camera: str) -> None:
     with pytest.raises(OutputError, match="a camera is one of front, right, back, left, top, bottom, or AZIMUTH"):

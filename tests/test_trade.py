@@ -200,6 +200,9 @@ def test_orders_have_bounds():
     assert observed_order(1e9, [1.0, 0.5, 0.25]) == MOST_ORDER
     assert extrapolate([np.ones(1), np.ones(1) * 1.5], [1.0, 0.5]).band == 0.5
     assert "rounding" in extrapolate([np.zeros(1), np.ones(1), np.ones(1)], [1.0, 0.5, 0.2]).remark
+    same = extrapolate([np.ones(1), np.ones(1) * 1.5, np.ones(1) * 1.75], [0.5, 0.5, 0.25])
+    assert (same.order, same.band) == (None, 0.25)
+    assert "do not get finer" in same.remark
 
 
 # ---- fronts
@@ -419,6 +422,7 @@ def test_failures_are_results(bar, tmp_path):
     """A crash, a hang, an end, a scene that is no scene, and steps that are too long."""
     actions = {
         "die": "import os; os.kill(os.getpid(), 9)",
+        "stop": "import os; os.kill(os.getpid(), 15)",
         "hang": "import time; time.sleep(60)",
         "end": "import os; os._exit(3)",
         "raise": "1 / 0",
@@ -433,13 +437,14 @@ def test_failures_are_results(bar, tmp_path):
         by_chance |= {setting.label} if outcome.by_chance else set()
     for name, reason in {
         "kind=die": "killed by SIGKILL",
+        "kind=stop": "killed by SIGTERM",
         "kind=hang": "out of time: more than 5 s",
         "kind=end": "ended with status 3",
         "kind=raise": "ZeroDivisionError",
         "solver=velocity_verlet E=10000000.0": "above the stability limit",
     }.items():
         assert reason in reasons[name]
-    assert by_chance == {"kind=die"}  # the others would fail again
+    assert by_chance == {"kind=die", "kind=stop"}  # the others would fail again
 
 
 def test_only_failures_that_may_go_away_are_run_again(bar, tmp_path, monkeypatch):
@@ -500,6 +505,34 @@ def test_nothing_is_measured_where_nothing_moves(bar, tmp_path, in_process):
         build_reference(own, mesh_control(own.problem), own.run([Setting()]))
 
 
+def test_a_quantity_without_a_value_is_told_of_with_its_reason(bar, tmp_path, monkeypatch):
+    def without(order: Order) -> Outcome:
+        outcome = fake(order)
+        outcome.missing = {"tip": "it does not swing"}
+        return outcome
+
+    monkeypatch.setattr("warpfem.trade.study.run_order", without)
+    own = study(bar, tmp_path, Here())
+    with pytest.raises(SimulationError, match="the reference has no value of 'tip': it does not swing"):
+        build_reference(own, mesh_control(own.problem), own.run([Setting()]), "tip")
+
+
+@pytest.mark.parametrize(
+    ("size", "limit", "remark"),
+    [(1.0, 600.0, "its meshes do not get finer"), (None, 0.1, "a finer mesh would take more than 0.1 s")],
+)
+def test_why_a_reference_is_no_finer(bar, tmp_path, monkeypatch, size, limit, remark):
+    def alike(order: Order) -> Outcome:
+        outcome = fake(order)
+        outcome.mesh_size = size or outcome.mesh_size
+        return outcome
+
+    monkeypatch.setattr("warpfem.trade.study.run_order", alike)
+    own = study(bar, tmp_path, Here(), limit=limit)
+    (found,) = build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)])).remarks
+    assert remark in found
+
+
 def test_errors_are_not_relative_to_nothing(bar, tmp_path, in_process):
     bar.write_text(BAR.replace('{"tip": tip}', '{"nothing": lambda motion: 0.0}'))
     own = study(bar, tmp_path / "a", Here())
@@ -519,6 +552,7 @@ def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, ca
     assert "The cheapest setting within 10 % of the motion (L2) is" in printed
     data = json.loads((out / "trade.json").read_text())
     assert len(data["settings"]) == 8
+    assert [machine["cores"] for machine in data["ran_on"]] == [data["machine"]["cores"]]
     edge = [record for record in data["settings"] if record["on_front"]]
     most = max(edge, key=lambda record: record["errors"]["l2"])
     parts = {kind: errors["l2"] for kind, errors in most["parts"].items()}

@@ -20,6 +20,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdValidation, Vt
 from warpfem.boundary import Box, BoxWalls, Plane, Sphere
 from warpfem.errors import MeshError, OutputError
 from warpfem.mesh import Mesh
+from warpfem.meshing import load_mesh
 from warpfem.usd import (
     BodyFrame,
     ColorScale,
@@ -31,6 +32,7 @@ from warpfem.usd import (
     read_pictured_stage,
     read_surface_mesh,
 )
+from warpfem.usd.normals import SurfaceNormals
 
 REPOSITORY = Path(__file__).parent.parent
 OBSTACLES = {
@@ -86,6 +88,15 @@ def attribute(stage: Usd.Stage, path: str, code: float | None = None) -> np.ndar
     return np.array(value.Get() if code is None else value.Get(code))
 
 
+def normals_of(mesh: UsdGeom.PointBased, code: float | None) -> tuple[np.ndarray, str]:
+    """The normals of a surface and what they belong to, as USD's rules have it: the primvar before the attribute."""
+    time = Usd.TimeCode.Default() if code is None else code
+    primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
+    if primvar:
+        return np.array(primvar.ComputeFlattened(time)), primvar.GetInterpolation()
+    return np.array(mesh.GetNormalsAttr().Get(time)), mesh.GetNormalsInterpolation()
+
+
 def validation_errors(stage: Usd.Stage) -> list[str]:
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
@@ -113,18 +124,18 @@ def assert_sound(path: Path, frame_count: int) -> None:
             face_count, corner_count = len(counts), counts.sum()
             assert len(indices) == corner_count
         assert indices.min() == 0 and indices.max() == point_count - 1
-        sizes = {"vertex": point_count, "uniform": face_count, "constant": 1}
+        sizes = {"vertex": point_count, "uniform": face_count, "faceVarying": corner_count, "constant": 1}
         for code in [None, *(codes if moves else [])]:
             points = attribute(stage, f"{prim.GetPath()}.points", code)
             extent = attribute(stage, f"{prim.GetPath()}.extent", code)
             assert len(points) == point_count and np.isfinite(points).all()
             assert np.array_equal(extent, [points.min(axis=0), points.max(axis=0)])
             if not prim.IsA(UsdGeom.TetMesh):
-                normals = attribute(stage, f"{prim.GetPath()}.normals", code)
-                assert len(normals) == sizes[mesh.GetNormalsInterpolation()]
+                normals, interpolation = normals_of(mesh, code)
+                assert len(normals) == sizes[interpolation]
                 assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-5)
             for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithAuthoredValues():
-                values = np.array(primvar.Get(Usd.TimeCode.Default() if code is None else code))
+                values = np.array(primvar.ComputeFlattened(Usd.TimeCode.Default() if code is None else code))
                 assert np.isfinite(values).all()
                 assert len(values) == sizes[primvar.GetInterpolation()]
         animated = [item for item in prim.GetAuthoredAttributes() if item.GetNumTimeSamples()]
@@ -264,9 +275,31 @@ def test_normals_point_outwards_and_turn_with_the_body(tmp_path: Path) -> None:
     with UsdWriter(tmp_path / "run.usdc", [body], fps=24) as writer:
         writer.write_frame([turned])
     stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
-    points, normals = (attribute(stage, f"/World/block/block_surface.{name}") for name in ("points", "normals"))
-    assert (np.einsum("ij,ij->i", points - body.rest_points.mean(axis=0), normals) > 0.1).all()
-    assert attribute(stage, "/World/block/block_surface.normals", 0) == pytest.approx(normals @ turn.T, abs=1e-6)
+    surface = UsdGeom.Mesh.Get(stage, "/World/block/block_surface")
+    normals, interpolation = normals_of(surface, None)
+    assert interpolation == "faceVarying"
+    corners = np.array(surface.GetPointsAttr().Get())[np.array(surface.GetFaceVertexIndicesAttr().Get())]
+    a, b, c = corners.reshape(-1, 3, 3).transpose(1, 0, 2)
+    flat = np.cross(b - a, c - a)
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    assert normals == pytest.approx(np.repeat(flat, 3, axis=0), abs=1e-6)  # each side of a box is flat
+    assert normals_of(surface, 0)[0] == pytest.approx(normals @ turn.T, abs=1e-6)
+
+
+def test_round_surfaces_have_one_normal_for_each_point(tmp_path: Path) -> None:
+    polar, around = np.linspace(0.0, np.pi, 13)[1:-1, None], np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    circles = np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0 * around
+    points = np.concatenate([np.stack(circles, axis=-1).reshape(-1, 3), [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]])
+    grid = np.arange(11 * 24).reshape(11, 24)
+    after, (top, bottom) = np.roll(grid, -1, axis=1), np.repeat([[264], [265]], 24, axis=1)
+    corners = [(grid[:-1], grid[1:], after[1:]), (grid[:-1], after[1:], after[:-1])]
+    corners += [(top, grid[0], after[0]), (bottom, after[-1], grid[-1])]
+    faces = np.concatenate([np.stack(parts, axis=-1).reshape(-1, 3) for parts in corners])
+    smooth = SurfaceNormals(points, faces)
+    assert not smooth.creased and np.array_equal(smooth.indices, faces)
+    assert np.einsum("ij,ij->i", smooth(points), points).min() > 0.99
+    flattened = points * (1.0, 1.0, 0.01)  # a disc with a rim
+    assert SurfaceNormals(flattened, faces).creased
 
 
 @pytest.mark.parametrize("dim", SETUPS)
@@ -307,7 +340,7 @@ def test_read_animation_gives_back_what_was_written(tmp_path: Path, dim: int) ->
 def test_an_output_is_a_mesh_again(tmp_path: Path) -> None:
     body = make_body(3)
     write(tmp_path / "run.usdc", [body], 2, obstacles=OBSTACLES[3])
-    mesh = read_mesh(tmp_path / "run.usdc")
+    mesh = load_mesh(tmp_path / "run.usdc")
     assert np.array_equal(mesh.cells, body.cells)
     assert np.array_equal(mesh.points, body.rest_points.astype(np.float32))
 

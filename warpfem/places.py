@@ -24,6 +24,9 @@ a curved surface off differently."""
 MOST_BOXES = 64
 """Boxes of the grid per cell, on average, in which places are looked for."""
 
+MOST_NUMBERED = 2.0**62
+"""Boxes that the grid may have, empty ones with the others, so that each has a number."""
+
 PAIRS_AT_ONCE = 1 << 18
 """Places and cells whose distances are computed at a time: 50 MB."""
 
@@ -101,23 +104,24 @@ def _near(lower: np.ndarray, upper: np.ndarray, places: np.ndarray) -> Iterator[
     while True:
         first = np.floor((lower - origin) / width).astype(np.int64)
         spans = np.floor((upper - origin) / width).astype(np.int64) - first + 1
-        counts = spans.prod(axis=1)
-        if counts.sum() <= MOST_BOXES * len(lower):
+        extent = (first + spans).max(axis=0)
+        boxes_in_all = spans.prod(axis=1, dtype=float).sum()  # float, as they may be more than integers can count
+        if boxes_in_all <= MOST_BOXES * len(lower) and extent.prod(dtype=float) < MOST_NUMBERED:
             break
         width *= 2.0
-    shape = (first + spans).max(axis=0)
+    counts = spans.prod(axis=1)
     owners, within = _ranges(counts)
-    boxes = np.zeros((len(owners), len(shape)), dtype=np.int64)
+    boxes = np.zeros((len(owners), len(extent)), dtype=np.int64)
     for axis, span in enumerate(spans[owners].T):
         boxes[:, axis] = first[owners, axis] + within % span
         within = within // span
-    keys = np.asarray(np.ravel_multi_index(tuple(boxes.T), tuple(shape)))
+    keys = np.asarray(np.ravel_multi_index(tuple(boxes.T), tuple(extent)))
     order = np.argsort(keys, kind="stable")
     keys, owners = keys[order], owners[order]
 
     at = np.floor((places - origin) / width).astype(np.int64)
-    inside = np.flatnonzero(((at >= 0) & (at < shape)).all(axis=1))
-    own = np.asarray(np.ravel_multi_index(tuple(at[inside].T), tuple(shape)))
+    inside = np.flatnonzero(((at >= 0) & (at < extent)).all(axis=1))
+    own = np.asarray(np.ravel_multi_index(tuple(at[inside].T), tuple(extent)))
     begins = np.searchsorted(keys, own, side="left")
     counts = np.searchsorted(keys, own, side="right") - begins
     portions = np.cumsum(counts) // PAIRS_AT_ONCE

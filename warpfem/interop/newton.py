@@ -101,11 +101,11 @@ class SolverWarpfem(newton.solvers.SolverBase):
     The rest shape is ``model.particle_q`` when the solver is made. Masses are ``particle_mass``: ``add_soft_mesh``
     shares that of the tetrahedra among them, while ``add_soft_grid`` gives each particle that of a whole cell of the
     grid. Gravity and ``state_in.particle_f`` act as they are at each step. Particles without mass or not ``ACTIVE``
-    are held where ``state_in`` has them: to move them, write their positions. Planes and spheres that do not move, and
-    that collide with particles, are obstacles in all worlds, whether or not contacts are given, with the friction
-    sqrt(soft_contact_mu mu); surfaces touch them, without ``particle_radius`` between. What warpfem has no counterpart
-    for is warned of when the solver is made, and stays as it is: cloth, springs, rigid bodies, ``k_damp``. Later
-    changes of the model, except of its gravity, want a new solver.
+    are held where ``state_in`` has them: to move them, write their positions. Planes, spheres and boxes that do not
+    move, and that collide with particles, are obstacles in all worlds, whether or not contacts are given, with the
+    friction sqrt(soft_contact_mu mu); surfaces touch them, without ``particle_radius`` between. What warpfem has no
+    counterpart for is warned of when the solver is made, and stays as it is: cloth, springs, rigid bodies, ``k_damp``.
+    Later changes of the model, except of its gravity, want a new solver.
 
     Steps decide on the host how they go on, and cannot be captured as a graph.
 

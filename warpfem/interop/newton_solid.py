@@ -7,7 +7,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpfem.boundary import Obstacle, Pin, Plane, Sphere
+from warpfem.boundary import Box, Obstacle, Pin, Plane, Sphere
 from warpfem.errors import MeshError, SceneError
 from warpfem.materials import HookeanMaterial
 from warpfem.mesh import Mesh
@@ -137,32 +137,41 @@ def _densities(mesh: Mesh, mass: np.ndarray, held: np.ndarray, name: str) -> tup
 
 
 def _obstacles(model: newton.Model) -> list[Obstacle]:
-    """The model's planes and spheres that do not move, each once; warns of other shapes that particles would touch."""
+    """The planes, spheres and boxes that do not move, each once; warns of other shapes that particles would touch."""
     if not model.shape_count:
         return []
     flags, kinds, bodies = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_body.numpy()
-    places, scales = model.shape_transform.numpy().astype(np.float64), model.shape_scale.numpy()
-    friction = np.sqrt(model.soft_contact_mu * model.shape_material_mu.numpy().astype(np.float64))
+    in_world = model.shape_world.numpy()
     worlds: dict[Obstacle, set[int]] = {}
-    for shape in np.flatnonzero(flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)):
-        label, place = model.shape_label[shape], tuple(places[shape, :3].tolist())
-        if bodies[shape] < 0 and kinds[shape] == newton.GeoType.PLANE:
-            if scales[shape, :2].any():
-                _warn(f"shape '{label}' is a plane with edges: it is taken for an infinite one")
-            normal = np.array(wp.quat_rotate(wp.quat(*places[shape, 3:]), wp.vec3(0.0, 0.0, 1.0)))
-            obstacle: Obstacle = Plane(place, tuple(normal.tolist()), friction=float(friction[shape]))
-        elif bodies[shape] < 0 and kinds[shape] == newton.GeoType.SPHERE:
-            obstacle = Sphere(place, float(scales[shape, 0]), friction=float(friction[shape]))
-        else:
-            kind = newton.GeoType(int(kinds[shape])).name.lower()
+    for shape in np.flatnonzero(flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)).tolist():
+        kind, label = newton.GeoType(int(kinds[shape])), model.shape_label[shape]
+        obstacle = _obstacle(model, shape, kind) if bodies[shape] < 0 else None
+        if obstacle is None:
             moves = " of a body" if bodies[shape] >= 0 else ""
-            _warn(f"shape '{label}' is a {kind}{moves}: solids pass through it")
+            _warn(f"shape '{label}' is a {kind.name.lower()}{moves}: solids pass through it")
             continue
-        worlds.setdefault(obstacle, set()).add(int(model.shape_world.numpy()[shape]))
+        if kind == newton.GeoType.PLANE and model.shape_scale.numpy()[shape, :2].any():
+            _warn(f"shape '{label}' is a plane with edges: it is taken for an infinite one")
+        worlds.setdefault(obstacle, set()).add(int(in_world[shape]))
     single = [obstacle for obstacle, own in worlds.items() if -1 not in own and len(own) < model.world_count]
     if single:
         _warn(f"obstacles of some worlds are felt in all ({len(single)} in all)")
     return list(worlds)
+
+
+def _obstacle(model: newton.Model, shape: int, kind: newton.GeoType) -> Obstacle | None:
+    """The obstacle that a shape is, if there is such a one."""
+    place, scale = model.shape_transform.numpy()[shape].tolist(), model.shape_scale.numpy()[shape].tolist()
+    center, turn = tuple(place[:3]), wp.quat(*place[3:])
+    axes = [np.array(wp.quat_rotate(turn, wp.vec3(*unit))).tolist() for unit in np.eye(3)]
+    friction = float(np.sqrt(model.soft_contact_mu * model.shape_material_mu.numpy()[shape]))
+    if kind == newton.GeoType.PLANE:
+        return Plane(center, axes[2], friction=friction)
+    if kind == newton.GeoType.SPHERE:
+        return Sphere(center, scale[0], friction=friction)
+    if kind == newton.GeoType.BOX:
+        return Box(center, [2.0 * half for half in scale], axes, friction=friction)
+    return None
 
 
 def _warn_of_omissions(model: newton.Model, point_count: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from warpfem.errors import OutputError
-from warpfem.preview.camera import USUAL, View, camera_axes
+from warpfem.preview.camera import SAMPLES, USUAL, View, camera_axes
 from warpfem.preview.canvas import Canvas, covered
 from warpfem.preview.coloring import Coloring
 from warpfem.preview.obstacles import Obstacle, normals_of
@@ -18,6 +18,8 @@ _OBSTACLE = np.array([0.84, 0.84, 0.85])
 _INSIDE_OUT = np.array([1.0, 0.0, 1.0])
 _TILE, _SHADOW, _PANE = 0.94, 0.76, 0.2
 """Factors of every other tile and of shadows; opacity of a plane that is seen from behind."""
+_EDGE_ON, _BAND = 1e-3, 4.0 * SAMPLES
+"""Sine of the angle below which a plane is seen from its side; the width that it then has [samples]."""
 
 
 class Scene:
@@ -91,7 +93,10 @@ class Scene:
         owner = np.full(len(canvas.depth), -1)
         for index, obstacle in enumerate(obstacles):
             samples, normals = view.project(obstacle.corners), normals_of(obstacle.corners)
-            if obstacle.is_plane and obstacle.normal @ view.axes[2] < 0.0:
+            toward = obstacle.normal @ view.axes[2] if obstacle.is_plane and not self._flat else 1.0
+            if abs(toward) < _EDGE_ON:
+                samples, normals = _band(samples, view.axes @ obstacle.normal), np.tile(obstacle.normal, (2, 1))
+            if toward <= -_EDGE_ON:
                 self._panes.append(covered(samples, view))
             else:
                 owner[canvas.draw(samples, self._shade(normals) * _OBSTACLE)] = index
@@ -108,3 +113,22 @@ class Scene:
         """(k, 1, 1) brightness of surfaces with these (k, 3) normals."""
         light = normals @ (_LIGHT @ self.view.axes) / np.linalg.norm(_LIGHT)
         return np.ones((len(normals), 1, 1)) if self._flat else (0.72 + 0.28 * light)[:, None, None]
+
+
+def _band(samples: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """What stands for a plane that is seen from its side.
+
+    Args:
+        samples: (k, 3, 3) corners of its triangles in the image [samples].
+        normal: (3,) its unit normal to the right, up and towards the viewer.
+
+    Returns:
+        (2, 3, 3) corners of a band behind its surface [samples].
+    """
+    points = samples.reshape(-1, 3)
+    away = _BAND * np.array([-normal[0], normal[1], 0.0])
+    along = points[:, :2] @ np.array([away[1], -away[0]])
+    first, last = points[along.argmin()].copy(), points[along.argmax()].copy()
+    first[2] = last[2] = points[:, 2].min()
+    corners = np.stack([first, last, last + away, first + away])
+    return corners[[(0, 1, 2), (0, 2, 3)]]

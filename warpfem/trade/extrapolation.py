@@ -68,6 +68,8 @@ def extrapolate(levels: Sequence[np.ndarray], sizes: Sequence[float]) -> Extrapo
     if not last < first:
         return Extrapolated(c, None, last, largest, f"it does not converge: changes of {first:.2e} and then {last:.2e}")
     h = [float(size) for size in sizes[-3:]]
+    if not h[0] > h[1] > h[2]:  # meshes that follow the details of a surface have as many cells whatever is asked for
+        return Extrapolated(c, None, last, largest, "the levels do not get finer one by one")
     if float(((b - a) * (c - b)).sum()) < ALIGNED * np.sqrt(((b - a) ** 2).sum() * ((c - b) ** 2).sum()):
         return Extrapolated(c, None, last, largest, "the changes shrink, but do not go the same way")
     order = observed_order(first / last, h)

@@ -17,6 +17,9 @@ from warpfem.trade.worker import LENGTH
 ATTEMPTS = 2
 """How often an order is run whose process is killed: once may be by chance."""
 
+KILLS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")
+"""Signals by which others end a process; by the rest it ends itself."""
+
 _running: set[subprocess.Popen[bytes]] = set()
 _ended: set[subprocess.Popen[bytes]] = set()
 
@@ -90,7 +93,8 @@ def _attempt(order: Order) -> tuple[Outcome, bool]:
     if late.is_set():
         why = f"out of time: more than {order.seconds:.0f} s"
         return Outcome(why, order.load, limit=order.seconds), False
-    killed = status == -signal.SIGKILL
-    why = f"was killed by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
-    hint = " (out of memory?)" if killed else f": {told[-1]}" if told else ""
+    name = signal.Signals(-status).name if status < 0 else ""
+    killed = name in KILLS
+    why = f"was killed by {name}" if name else f"ended with status {status}"
+    hint = " (out of memory?)" if name == "SIGKILL" else f": {told[-1]}" if told else ""
     return Outcome(f"the process {why}{hint}", order.load, by_chance=killed), killed and not ended

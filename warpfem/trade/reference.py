@@ -136,7 +136,9 @@ class _Builder:
             reference, cross = self._reference()
             parts = reference.parts.get(name)
             if parts is None:
-                raise SimulationError(f"the reference has no value of '{name}': it has {', '.join(reference.names)}")
+                runs = [point.first for point in self.study.solve(self._settings())]
+                why = next((run.missing[name] for run in runs if name in run.missing), "")
+                raise SimulationError(f"the reference has no value of '{name}'" + (f": {why}" if why else ""))
             if not reference.scales[name] > 0.0:
                 raise SimulationError(f"the reference has 0 for '{name}': no error is relative to that")
             best = min((reference.errors(p.first).get(name, math.inf) for p in self.asked), default=math.inf)
@@ -219,9 +221,13 @@ class _Builder:
             self.remarks.append(f"{MOST_LEVELS} meshes are not enough")
             return False
         last = self.study.solve(self._space()[-1:])[0].first
+        why = "its meshes do not get finer"
         for factor in (2.0, 1.5):
             finer = self.mesh.finer(self.meshes[-1], factor)
-            if finer is None or not self._affordable(factor ** (self.study.scene.dim + 1) * last.seconds[0]):
+            if not self._affordable(factor ** (self.study.scene.dim + 1) * last.seconds[0]):
+                why = f"a reference with a finer mesh would take more than {self.study.limit:g} s"
+                continue
+            if finer is None:
                 continue
             (point,) = self.study.solve([self._timed(finer, self.steps[self.shared])])
             if point.failure:
@@ -230,7 +236,7 @@ class _Builder:
             if point.first.mesh_size < LEAST_CHANGE * last.mesh_size:
                 self.meshes.append(finer)
                 return True
-        self.remarks.append(f"a reference with a finer mesh would take more than {self.study.limit:g} s")
+        self.remarks.append(why)
         return False
 
     def _grow_steps(self) -> bool:

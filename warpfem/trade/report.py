@@ -107,11 +107,12 @@ def data(own: Sweep) -> dict[str, Any]:
         {
             "scene": problem.path,
             "parameters": dict(problem.parameters),
-            "frames": own.study.scene.frames if problem.frames is None else problem.frames,
+            "frames": own.study.scene.frames,
             "axes": {axis.name: list(axis.values) for axis in own.axes},
             "quantity": own.name,
             "load": own.study.load,
             "machine": facts(),
+            "ran_on": _machines(own.points),
             "reference": None if own.reference is None else _reference_data(own.reference),
             "refusal": own.refusal,
             "settings": [
@@ -121,6 +122,16 @@ def data(own: Sweep) -> dict[str, Any]:
             "answers": [_answer_data(answer) for answer in own.answers],
         }
     )
+
+
+def _machines(points: Sequence[Point]) -> list[dict[str, Any]]:
+    """The machines that settings ran on, which can be others than that of the command, each once."""
+    found: list[dict[str, Any]] = []
+    for outcome in (outcome for point in points for outcome in point.outcomes):
+        machine = {name: value for name, value in outcome.machine.items() if name != "load_average"}
+        if machine not in found:
+            found.append(machine)
+    return found
 
 
 def _reference_data(reference: Reference) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from warpfem.usd.meshes import read_mesh, read_surface_mesh
 from warpfem.usd.over import OverWriter, frames_over, require_other_file
 from warpfem.usd.physics.author import BodyPhysics, ScenePhysics, too_many_materials
 from warpfem.usd.physics.reader import read_stage_scene
-from warpfem.usd.pictured import PicturedStage, Standing, SurfaceFrame, read_pictured_stage
+from warpfem.usd.pictured import PicturedStage, SurfaceFrame, read_pictured_stage
 from warpfem.usd.saved import partial_path
 from warpfem.usd.writer import UsdWriter
 
@@ -32,7 +32,6 @@ __all__ = [
     "OverWriter",
     "PicturedStage",
     "ScenePhysics",
-    "Standing",
     "SurfaceFrame",
     "UsdBody",
     "UsdWriter",

@@ -1,4 +1,4 @@
-"""Reads animations back, frame by frame, for pictures and tests."""
+"""Reads the animations that warpfem wrote back, frame by frame: to go on with them, and to compare."""
 
 from __future__ import annotations
 

@@ -133,12 +133,3 @@ def cells_of_faces(body: UsdBody) -> np.ndarray:
             f"{stray[0]}: {body.surface_faces[stray[0]].tolist()}"
         )
     return owners[found]
-
-
-def point_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n, 3) float32 unit normals at points: the sum of the area vectors of the faces around."""
-    a, b, c = (points[faces[:, corner]].astype(np.float64) for corner in range(3))
-    areas = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    summed = np.column_stack([np.bincount(faces.ravel(), axis, minlength=len(points)) for axis in areas.T])
-    lengths = np.linalg.norm(summed, axis=1, keepdims=True)
-    return (summed / np.where(lengths > 0.0, lengths, 1.0)).astype(np.float32)

@@ -16,9 +16,9 @@ from warpfem.usd.bodies import (
     as_float32,
     cells_of_faces,
     in_space,
-    point_normals,
 )
 from warpfem.usd.colors import ColorQuantity, ColorScale
+from warpfem.usd.normals import SurfaceNormals
 
 WORLD = Sdf.Path("/World")
 TETS, OBSTACLES = "simulation", "Obstacles"
@@ -139,8 +139,15 @@ class BodyPrims:
         surface = UsdGeom.Mesh.Define(stage, self._surface)
         set_topology(surface, self._faces)
         surface.CreateDoubleSidedAttr(self._tets is None)
-        surface.CreateNormalsAttr()
-        surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        self._normals = SurfaceNormals(rest[used], self._faces)
+        if self._normals.creased:
+            normals = UsdGeom.PrimvarsAPI(surface).CreatePrimvar(
+                "normals", Sdf.ValueTypeNames.Normal3fArray, UsdGeom.Tokens.faceVarying
+            )
+            normals.SetIndices(Vt.IntArray.FromNumpy(self._normals.indices.ravel()))
+        else:
+            surface.CreateNormalsAttr()
+            surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         surface.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
         _create_primvars(surface)
         bind(surface.GetPrim(), "Body")
@@ -182,8 +189,8 @@ class BodyPrims:
 
         surface_points = points[self._used]
         result = _point_based(self._surface, surface_points, velocities[self._used])
-        normals = Vt.Vec3fArray.FromNumpy(point_normals(surface_points, self._faces))
-        result[self._surface.AppendProperty("normals")] = normals
+        name = "primvars:normals" if self._normals.creased else "normals"
+        result[self._surface.AppendProperty(name)] = Vt.Vec3fArray.FromNumpy(self._normals(surface_points))
         for quantity in cells:
             result |= _primvar(self._surface, CELL_PRIMVARS[quantity], cells[quantity][self._owners])
             result |= _primvar(self._surface, POINT_PRIMVARS[quantity], averages[quantity][self._used])
