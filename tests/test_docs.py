@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import math
 import re
 import sys
 from pathlib import Path
@@ -72,6 +73,23 @@ def check_neighbours(names: dict, printed: list[str]) -> None:
     assert 0.8 < lowest < 0.999 and residual < 1e-3
 
 
+def check_scenes(names: dict, printed: list[str]) -> None:
+    """The last block grows a cube of 1 m by 10 % in a float64 model: psi of the default material by hand."""
+    model, state = names["model"], names["state"]
+    moduli = wf.elastic_moduli(E=1e6, nu=0.3)
+    mu, lam = 4 / 3 * moduli.mu, moduli.lam + 5 / 6 * moduli.mu
+    a = 1 + 3 * mu / (4 * lam)
+
+    def psi(I_C: float, J: float) -> float:
+        return mu / 2 * (I_C - 3 - math.log(I_C + 1)) + lam / 2 * (J - a) ** 2
+
+    assert model.energies(state).elastic == pytest.approx(psi(3 * 1.1**2, 1.1**3) - psi(3, 1), rel=1e-9)
+
+
+def check_start(names: dict, printed: list[str]) -> None:
+    assert len(printed) == 1 + 3  # of the run, and a line per frame
+
+
 def check_usd(names: dict, printed: list[str]) -> None:
     """A run reads back as the scene that it was, and a layer over it has what it has."""
     assert printed[-2:] == ["100000.0 (0.0, -9.81, 0.0) 3", "True"]
@@ -82,6 +100,8 @@ CHECKS = {
     "materials": check_materials,
     "neighbours": check_neighbours,
     "runs": check_runs,
+    "scenes": check_scenes,
+    "start": check_start,
     "statics": check_statics,
     "usd": check_usd,
 }

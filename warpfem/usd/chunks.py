@@ -154,23 +154,26 @@ class ChunkedLayer:
 
     def _write_merged(self, path: Path, metadata: dict[str, Any], amend: Callable[[Samples], Samples]) -> None:
         merged = Sdf.Layer.CreateNew(str(path))
-        merged.TransferContent(self._static)
-        self._go_over_base(merged)
-        self._describe(merged, metadata)
-        unsaved = 0.0
-        for chunk in self._chunks:
-            layer = chunk.open()
-            frame_bytes = chunk.path.stat().st_size / len(chunk.frames)
-            for frame in chunk.frames:
-                code = self._clock.code(frame)
-                samples = {attribute: layer.QueryTimeSample(attribute, code) for attribute in self._animated}
-                for attribute, value in (samples | amend(samples)).items():
-                    merged.SetTimeSample(attribute, code, value)
-                unsaved += frame_bytes
-                if unsaved > _MERGE_BYTES:
-                    merged.Save()
-                    unsaved = 0.0
-        merged.Save()
+        try:
+            merged.TransferContent(self._static)
+            self._go_over_base(merged)
+            self._describe(merged, metadata)
+            unsaved = 0.0
+            for chunk in self._chunks:
+                layer = chunk.open()
+                frame_bytes = chunk.path.stat().st_size / len(chunk.frames)
+                for frame in chunk.frames:
+                    code = self._clock.code(frame)
+                    samples = {attribute: layer.QueryTimeSample(attribute, code) for attribute in self._animated}
+                    for attribute, value in (samples | amend(samples)).items():
+                        merged.SetTimeSample(attribute, code, value)
+                    unsaved += frame_bytes
+                    if unsaved > _MERGE_BYTES:
+                        merged.Save()
+                        unsaved = 0.0
+            merged.Save()
+        finally:
+            del merged  # the traceback of an error would keep the layer open, and with it its name
 
     def _write_root(self, metadata: dict[str, Any], *new: Chunk) -> None:
         folder = f"./{self._folder.name}"
