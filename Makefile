@@ -10,6 +10,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+PARALLEL := --numprocesses auto --dist loadfile # tests of a file share kernels
 
 .PHONY: demo test slow verify bench docs gallery lint clean
 
@@ -31,10 +32,10 @@ demo: $(VENV)/extras
 	@if [ -f output/bear.png ]; then echo "A picture:     $(CURDIR)/output/bear.png"; fi
 
 test: $(VENV)/extras
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 slow: $(VENV)/extras
-	$(BIN)/python -m pytest -m 'slow or not slow'
+	$(BIN)/python -m pytest $(PARALLEL) -m 'slow or not slow'
 
 verify: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench,solvers]'
