@@ -129,11 +129,25 @@ def _study(study: Study, result: dict[str, Any], plots: str) -> list[str]:
     lines += [f"- {answer['sentence']}" for answer in result["answers"]]
     reference = result["reference"]["names"][study.quantity]
     band = reference["band"]
-    lines += ["", "The front, from fast to accurate:", "", "| setting | time | error |", "| --- | --- | --- |"]
-    for row in sorted(result["settings"], key=lambda row: row.get("seconds", 0.0)):
-        if row["on_front"]:
-            setting = " ".join(f"{name}={value}" for name, value in row["setting"].items())
-            lines.append(f"| {setting} | {_time(row)} | {_error(row, study.quantity, band)} |")
+    front = sorted((row for row in result["settings"] if row["on_front"]), key=lambda row: row["seconds"])
+    kinds = ("space", "time", "algebra")
+    lines += [
+        "",
+        *_prose(
+            "The front, from fast to accurate, and how much the motion changes where the mesh, the steps, or the "
+            "tolerance and the precision alone are made finer:"
+        )[:-1],
+        "",
+        f"| setting | time | error | {' | '.join(kinds)} |",
+        "| --- " * (3 + len(kinds)) + "|",
+    ]
+    for row in front:
+        setting = " ".join(f"{name}={value}" for name, value in row["setting"].items())
+        parts = [row["parts"].get(kind, {}).get(study.quantity) for kind in kinds]
+        shares = " | ".join("" if part is None else _percent(part) for part in parts)
+        lines.append(f"| {setting} | {_time(row)} | {_error(row, study.quantity, band)} | {shares} |")
+    lines += ["", "What is on the front, value by value, from its largest to its least error:", ""]
+    lines += [f"- {name}: {_places(front, name, study.quantity)}" for name in result["axes"]]
     orders = ", ".join(
         f"in {kind} {part['order']:.1f}" for kind, part in reference["parts"].items() if part.get("order") is not None
     )
@@ -142,13 +156,26 @@ def _study(study: Study, result: dict[str, Any], plots: str) -> list[str]:
         "",
         *_prose(
             f"{len(result['settings'])} settings, {failed} of which failed. The reference: orders "
-            f"{orders or 'not seen'}, band {100 * band:.2g} %. All of it: "
+            f"{orders or 'not seen'}, band {_percent(band)}. All of it: "
             f"[{study.name}.json]({plots}/{study.name}.json), [{study.name}.csv]({plots}/{study.name}.csv). "
             f"{machine['processor']}, {machine['cores']} cores; warpfem "
             f"{machine['warpfem']}, warp {machine['warp']}."
         ),
     ]
     return lines
+
+
+def _places(front: list[dict[str, Any]], axis: str, quantity: str) -> str:
+    """Where each value of an axis is on the front."""
+    errors: dict[str, list[float]] = {}
+    for row in front:
+        errors.setdefault(row["setting"].get(axis, "as written"), []).append(row["errors"][quantity])
+    spans = {value: dict.fromkeys((_percent(max(own)), _percent(min(own)))) for value, own in errors.items()}
+    return ", ".join(f"{value} ({' to '.join(span)})" for value, span in spans.items())
+
+
+def _percent(part: float) -> str:
+    return f"{100 * part:.2g} %"
 
 
 def _wrapped_command(study: Study) -> list[str]:
@@ -163,7 +190,7 @@ def _time(row: dict[str, Any]) -> str:
 
 def _error(row: dict[str, Any], name: str, band: float) -> str:
     error = row["errors"][name]
-    return f"{100 * error:.2g} %" if row["resolved"] else f"< {100 * (error + band):.2g} %"
+    return _percent(error) if row["resolved"] else f"< {_percent(error + band)}"
 
 
 def _prose(text: str) -> list[str]:
