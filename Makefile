@@ -3,6 +3,7 @@
 # make slow   the long checks too
 # make verify the verification suite, which writes docs/accuracy.md
 # make bench  the benchmarks beside other codes, which write docs/performance.md
+# make trade  the studies of speed against accuracy, which write docs/trade.md
 # make docs   the documentation, in docs/_build
 # make gallery the pictures of the documentation, from the shipped scenes
 # make lint   style and types
@@ -12,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PARALLEL := --numprocesses auto --dist loadfile # tests of a file share kernels
 
-.PHONY: demo test slow verify bench docs gallery lint clean
+.PHONY: demo test slow verify bench trade docs gallery lint clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -44,6 +45,9 @@ verify: $(VENV)/installed
 bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench,plot,solvers]'
 	$(BIN)/python benchmarks/performance --install --peers .peers --out docs/performance.md
+
+trade: $(VENV)/extras
+	$(BIN)/python benchmarks/trade.py --out docs/trade.md
 
 docs: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'

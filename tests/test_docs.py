@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import math
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from warpfem.cli import parser
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-GENERATED = {"accuracy.md", "performance.md", "stability.md", "gpu.md"}
+GENERATED = {"accuracy.md", "performance.md", "stability.md", "trade.md", "gpu.md"}
 OPTIONAL = ("meshio", "newton")
 
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -110,10 +111,9 @@ CHECKS = {
 @pages
 def test_commands_are_those_of_the_parser(page):
     for block in blocks(page, ""):
-        for line in block.splitlines():
+        for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("warpfem "):
-                arguments = line.partition("#")[0].split()[1:]
-                parser().parse_args([argument.strip("'\"") for argument in arguments])
+                parser().parse_args(shlex.split(line, comments=True)[1:])
             for target in re.findall(r"^make (\w+)", line):
                 assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), line
 
@@ -122,7 +122,7 @@ def test_commands_are_those_of_the_parser(page):
 def test_files_and_tests_that_are_named_exist(page):
     text = page.read_text()
     for name, test in re.findall(r"((?:benchmarks|docs|scenes|tests|warpfem)/[\w/.-]*\w)(?:::(\w+))?", text):
-        if name.startswith("benchmarks/blender"):
+        if name.startswith(("benchmarks/blender", "docs/_build")):
             continue
         path = ROOT / name
         assert path.exists(), name
