@@ -3,7 +3,7 @@
     python benchmarks/trade.py [--out docs/trade.md] [--folder output/trade] [--scene NAME ...]
 
 Each study is one `warpfem trade` command, which the page names; it goes on from what an earlier run has left in the
-folder. Some ten minutes for each scene, on an idle machine.
+folder. Ten to thirty minutes for each scene, on an idle machine.
 """
 
 import argparse
@@ -59,7 +59,7 @@ STUDIES = (
         "deepest",
         ("cells=2,4,6", "element=P1,P2", "solver=backward_euler,sdirk2", "dt=1/60,1/240"),
         "A soft cube falls on a floor. Errors are of how far the middle of its top comes down at the deepest.",
-        ("--frames", "18", "--limit", "60"),
+        ("--frames", "18", "--limit", "240"),
     ),
     Study(
         "twist",

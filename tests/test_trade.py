@@ -482,7 +482,7 @@ def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_proce
     own = study(bar, tmp_path / "a", Here())
     settings = [Setting.of(cells=1, element="P2", dt="1/20"), Setting.of(cells=2, element="P1", dt="1/20")]
     asked = own.run(settings)
-    found = build_reference(own, mesh_control(own.problem), asked)
+    found = build_reference(own, mesh_control(own.problem), asked, explicit=False)
     exact = {"dtype": "float64", "solver": "sdirk3", "dt": "1/80", "tolerance": "1e-8"}
     (truth,) = own.run([Setting.of(cells=10, element="P2", **exact)])
     assert not truth.failure
@@ -502,7 +502,7 @@ def test_the_steps_of_the_reference_are_not_those_of_explicit_settings(bar, tmp_
     for asked_point, dt, iterations in zip(asked, (1 / 40, 1e-4), (30, 0), strict=True):
         asked_point.first.shortest_dt = asked_point.first.longest_dt = dt
         asked_point.first.newton_iterations = iterations
-    build_reference(own, mesh_control(own.problem), asked)
+    build_reference(own, mesh_control(own.problem), asked, explicit=False)
     assert {label.rpartition("dt=")[2] for label in runs.labels[2:]} == {"1/20", "1/40", "1/80"}
 
 
@@ -510,7 +510,7 @@ def test_nothing_is_measured_where_nothing_moves(bar, tmp_path, in_process):
     bar.write_text(BAR.replace("gravity=(0, -1)", "gravity=None"))
     own = study(bar, tmp_path / "a", Here())
     with pytest.raises(SimulationError, match="nothing moves"):
-        build_reference(own, mesh_control(own.problem), own.run([Setting()]))
+        build_reference(own, mesh_control(own.problem), own.run([Setting()]), explicit=False)
 
 
 def test_a_quantity_without_a_value_is_told_of_with_its_reason(bar, tmp_path, monkeypatch):
@@ -522,7 +522,7 @@ def test_a_quantity_without_a_value_is_told_of_with_its_reason(bar, tmp_path, mo
     monkeypatch.setattr("warpfem.trade.study.run_order", without)
     own = study(bar, tmp_path, Here())
     with pytest.raises(SimulationError, match="the reference has no value of 'tip': it does not swing"):
-        build_reference(own, mesh_control(own.problem), own.run([Setting()]), "tip")
+        build_reference(own, mesh_control(own.problem), own.run([Setting()]), "tip", explicit=False)
 
 
 @pytest.mark.parametrize(
@@ -537,7 +537,7 @@ def test_why_a_reference_is_no_finer(bar, tmp_path, monkeypatch, size, limit, re
 
     monkeypatch.setattr("warpfem.trade.study.run_order", alike)
     own = study(bar, tmp_path, Here(), limit=limit)
-    (found,) = build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)])).remarks
+    (found,) = build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)]), explicit=False).remarks
     assert remark in found
 
 
@@ -545,7 +545,7 @@ def test_errors_are_not_relative_to_nothing(bar, tmp_path, in_process):
     bar.write_text(BAR.replace('{"tip": tip}', '{"nothing": lambda motion: 0.0}'))
     own = study(bar, tmp_path / "a", Here())
     with pytest.raises(SimulationError, match="the reference has 0 for 'nothing'"):
-        build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)]), "nothing")
+        build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)]), "nothing", explicit=False)
 
 
 def test_the_command_writes_a_front_with_its_parts(bar, tmp_path, in_process, capsys):

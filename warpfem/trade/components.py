@@ -7,8 +7,8 @@ Each is the difference that one change makes. Of implicit schemes:
 - algebra: the setting itself, against itself in float64 with a tolerance of 1e-8;
 - model: what it changes of the problem, on the reference's coarsest mesh, against that without.
 
-Explicit steps are halved instead, which leaves a part 2^-p of their error, p being their order: what that changes is in
-time, the rest, that of another model too, in space.
+Where the reference takes explicit steps, those of the setting are halved instead, which leaves a part 2^-p of their
+error, p being their order: what that changes is in time, the rest in space.
 """
 
 from __future__ import annotations
@@ -107,25 +107,34 @@ class _Implicit(_Separator):
 
 
 class _Explicit(_Separator):
-    def __init__(self, study: Study, reference: Reference, point: Point, solver: Solver) -> None:
+    def __init__(self, study: Study, mesh: MeshControl, reference: Reference, point: Point, solver: Solver) -> None:
         super().__init__(study, reference, point)
         self.order = solver.order
+        model = {name: value for name, value in point.setting if kind_of(name, mesh) == "model"}
         self.halved = point.setting.changed(**{f"{FORCED}dt": repr(0.5 * point.first.shortest_dt)})
+        self.space = self.halved.changed(**dict.fromkeys(model))
         self.algebra = point.setting.changed(
             **(FINE_ALGEBRA if isinstance(solver, ImplicitSolver) else {"dtype": "float64"})
         )
+        self.shared = reference.ladders["space"][0].setting
+        self.model = self.shared.changed(**model) if model else None
 
     def needed(self) -> list[Setting]:
-        return [self.halved, self.algebra]
+        return [own for own in (self.halved, self.space, self.algebra, self.model) if own is not None]
 
     def parts(self) -> dict[str, Errors]:
         found = {}
-        halved, exact = self._outcome(self.halved), self._outcome(self.algebra)
+        halved, space, exact = (self._outcome(own) for own in (self.halved, self.space, self.algebra))
+        if space is not None:
+            found["space"] = self._errors(space, self.reference.outcome)
         if halved is not None:
-            found["space"] = self._errors(halved, self.reference.outcome)
             found["time"] = self._errors(self.point.first, halved, 1.0 / (1.0 - 0.5**self.order))
         if exact is not None:
             found["algebra"] = self._errors(self.point.first, exact)
+        if self.model is not None:
+            changed, shared = self._outcome(self.model), self._outcome(self.shared)
+            if changed is not None and shared is not None:
+                found["model"] = self._errors(changed, shared)
         return found
 
 
@@ -133,4 +142,4 @@ def _separator(study: Study, mesh: MeshControl, reference: Reference, point: Poi
     solver = study.problem.build(point.setting).scene.solver
     if isinstance(solver, ImplicitSolver) and "time" in reference.limits:
         return _Implicit(study, mesh, reference, point)
-    return _Explicit(study, reference, point, solver)
+    return _Explicit(study, mesh, reference, point, solver)

@@ -18,7 +18,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from warpfem.errors import SimulationError
-from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import MeshControl
 from warpfem.trade.ladders import LadderSum, Part, Rung
 from warpfem.trade.outcome import Outcome
@@ -91,7 +90,7 @@ def build_reference(
     least: float = 0.0,
     *,
     within: float | None = None,
-    explicit: bool | None = None,
+    explicit: bool,
 ) -> Reference:
     """The reference of settings that have been run.
 
@@ -102,13 +101,11 @@ def build_reference(
         name: of what: a norm, or a quantity of the scene.
         least: the smallest relative error that matters: that of a number can be nothing by accident.
         within: the error band to reach, whatever the errors of the settings are; ``None`` for a part of these.
-        explicit: whether its runs take explicit steps; ``None`` as the scene does.
+        explicit: whether its runs take explicit steps, as long as each mesh allows.
 
     Raises:
         SimulationError: no ladder of two levels could be run, or the quantity has no value, or that of 0.
     """
-    if explicit is None:
-        explicit = not isinstance(study.scene.solver, ImplicitSolver)
     builder = _Builder(study, mesh, [point for point in asked if not point.failure], implicit=not explicit)
     return builder.build(name, least, within)
 

@@ -12,6 +12,7 @@ from warpfem.trade.front import Answer, Candidate, answer, candidates, front
 from warpfem.trade.problem import Problem, Setting
 from warpfem.trade.reference import L2, LARGEST, Reference, build_reference
 from warpfem.trade.study import Point, Study
+from warpfem.trade.tuning_reference import beginning
 
 TARGETS = (0.1, 0.01, 0.001)
 """Relative errors that are answered if none is asked for."""
@@ -91,7 +92,8 @@ def sweep(
     reference, refusal = None, ""
     ordered: list[Candidate] = []
     try:
-        reference = build_reference(study, mesh, points, name, min(targets))
+        _, explicit = beginning(study, mesh)
+        reference = build_reference(study, mesh, points, name, min(targets), explicit=explicit)
     except SimulationError as error:
         refusal = str(error)
     points = study.run(settings, repeats)

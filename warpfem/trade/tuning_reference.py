@@ -37,7 +37,7 @@ def reference_within(study: Study, mesh: MeshControl, name: str, target: float) 
     Raises:
         SimulationError: there is none that is accurate enough.
     """
-    start, explicit = _beginning(study, mesh)
+    start, explicit = beginning(study, mesh)
     how = "explicit" if explicit else "implicit"
     study.say(f"a reference for {percent(target)} of {label(name)}, by {how} steps")
     reference = build_reference(study, mesh, [start], name, within=PRECISE * target, explicit=explicit)
@@ -50,7 +50,7 @@ def reference_within(study: Study, mesh: MeshControl, name: str, target: float) 
     return reference, explicit
 
 
-def _beginning(study: Study, mesh: MeshControl) -> tuple[Point, bool]:
+def beginning(study: Study, mesh: MeshControl) -> tuple[Point, bool]:
     """The coarsest mesh that can be run, and whether explicit steps make a reference cheaper.
 
     Raises:
