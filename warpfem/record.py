@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,10 @@ from warpfem.simulation import Frame, Simulation, Summary
 from warpfem.stage import physics_of
 
 if TYPE_CHECKING:
-    from warpfem.usd import BodyFrame, UsdBody
+    from warpfem.usd import BodyFrame, UsdBody, UsdWriter
+
+COMMENT = f"warpfem {__version__}"
+"""What files say of where they come from."""
 
 
 def record(
@@ -61,7 +64,7 @@ def record(
             before the first step where that can be known, and then nothing has been changed.
         SimulationError: the run cannot go on; the frames so far are in the file.
     """
-    from warpfem.usd import BackgroundWriter, FrameWriter, OverWriter, UsdWriter
+    from warpfem.usd import BackgroundWriter, FrameWriter, OverWriter
 
     if checkpoint_every is not None and not (isinstance(checkpoint_every, int) and checkpoint_every >= 1):
         raise OutputError(f"checkpoint_every must be a number of frames of at least 1, not {checkpoint_every!r}")
@@ -80,24 +83,13 @@ def record(
         frame = simulation.restore(start.frame, start.time, start.displacement, start.velocity)
         keep = start.frame, body_frames(simulation.model, frame)
     run_log = None if log is None else RunLog(log, simulation, None if start is None else start.frame)
-    comment, expected_frames = f"warpfem {__version__}", scene.frames + 1
+    expected_frames = scene.frames + 1
     usd_writer: FrameWriter
     if over is not None:
         names = [body.name for body in scene.bodies]
-        usd_writer = OverWriter(path, over, names, fps=scene.fps, comment=comment, expected_frames=expected_frames)
+        usd_writer = OverWriter(path, over, names, fps=scene.fps, comment=COMMENT, expected_frames=expected_frames)
     else:
-        usd_writer = UsdWriter(
-            path,
-            usd_bodies(scene),
-            fps=scene.fps,
-            up_axis=scene.up_axis,
-            obstacles=scene.obstacles,
-            physics=physics_of(scene),
-            color_by=scene.color_by,
-            comment=comment,
-            keep=keep,
-            expected_frames=expected_frames,
-        )
+        usd_writer = scene_writer(path, scene, keep=keep, expected_frames=expected_frames)
     with BackgroundWriter(usd_writer) as writer, run_log or contextlib.nullcontext():
         _remove(failure_file)
         if start is None:
@@ -164,7 +156,24 @@ def run(
     return simulation.summary
 
 
-def usd_bodies(scene: Scene) -> list[UsdBody]:
+def scene_writer(path: str | Path, scene: Scene, **options: Any) -> UsdWriter:
+    """A writer of the frames of a scene, with other options of :class:`UsdWriter`."""
+    from warpfem.usd import UsdWriter
+
+    return UsdWriter(
+        path,
+        _usd_bodies(scene),
+        fps=scene.fps,
+        up_axis=scene.up_axis,
+        obstacles=scene.obstacles,
+        physics=physics_of(scene),
+        color_by=scene.color_by,
+        comment=COMMENT,
+        **options,
+    )
+
+
+def _usd_bodies(scene: Scene) -> list[UsdBody]:
     """What the USD writer takes of the bodies."""
     from warpfem.usd import UsdBody
 

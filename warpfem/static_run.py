@@ -11,16 +11,14 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warpfem import __version__
 from warpfem.dtypes import FloatName
 from warpfem.errors import SceneError
 from warpfem.model import Energies, Model
 from warpfem.reactions import PointForces, Reactions, reactions
-from warpfem.record import body_frames, usd_bodies
+from warpfem.record import body_frames, scene_writer
 from warpfem.scene import Scene
 from warpfem.simulation import Frame, observe
 from warpfem.solvers.static import StaticEquilibrium, at_rest, require_solvable
-from warpfem.stage import physics_of
 
 
 @dataclass(frozen=True)
@@ -185,22 +183,9 @@ def record_static(run: StaticRun, path: str | Path) -> Generator[Frame, None, No
         OutputError: the file cannot be written.
         SimulationError: as :meth:`StaticRun.frames`.
     """
-    from warpfem.usd import UsdWriter
-
     frames = run.frames()
     first = [next(frames), next(frames)]
-    scene = run.scene
-    with UsdWriter(
-        path,
-        usd_bodies(scene),
-        fps=scene.fps,
-        up_axis=scene.up_axis,
-        obstacles=scene.obstacles,
-        physics=physics_of(scene),
-        color_by=scene.color_by,
-        equilibria=True,
-        comment=f"warpfem {__version__}",
-    ) as writer:
+    with scene_writer(path, run.scene, equilibria=True) as writer:
         for frame in chain(first, frames):
             writer.write_frame(body_frames(run.model, frame))
             yield frame

@@ -71,16 +71,7 @@ def load_mesh(
     """
     path = existing(path, MeshError)
     _check_options(scale, up_axis)
-    suffix = path.suffix.lower()
-    found: Solid | Surface
-    if suffix in _USD:
-        from warpfem.usd import read_mesh
-
-        found = read_mesh(path)
-    elif suffix in trimesh_files.SUFFIXES:
-        found = _read_by("trimesh", trimesh_files.read, path)
-    else:
-        found = _read_by("meshio", meshio_files.read_solid_or_surface, path)
+    found: Solid | Surface = _read(path, surface=False)
     with naming(path):
         points = _placed(found, scale, up_axis)
         if isinstance(found, Surface):
@@ -112,17 +103,21 @@ def read_surface(
     """
     path = existing(path, MeshError)
     _check_options(scale, up_axis)
-    suffix = path.suffix.lower()
-    if suffix in _USD:
-        from warpfem.usd import read_surface_mesh
-
-        found = read_surface_mesh(path)
-    elif suffix in trimesh_files.SUFFIXES:
-        found = _read_by("trimesh", trimesh_files.read, path)
-    else:
-        found = _read_by("meshio", meshio_files.read_surface, path)
+    found: Surface = _read(path, surface=True)
     with naming(path):
         return checked_surface(_placed(found, scale, up_axis), found.triangles)
+
+
+def _read(path: Path, *, surface: bool) -> Any:
+    """What a file holds, or the surface in it alone, by the library that reads it."""
+    suffix = path.suffix.lower()
+    if suffix in _USD:
+        from warpfem.usd import read_mesh, read_surface_mesh
+
+        return read_surface_mesh(path) if surface else read_mesh(path)
+    if suffix in trimesh_files.SUFFIXES:
+        return _read_by("trimesh", trimesh_files.read, path)
+    return _read_by("meshio", meshio_files.read_surface if surface else meshio_files.read_solid_or_surface, path)
 
 
 def _read_by(package: str, read: Any, path: Path) -> Any:

@@ -46,96 +46,92 @@ def components(
     return [own.parts() for own in separators]
 
 
-class _Separator:
-    """The runs that separate the errors of one setting."""
+Pair = tuple[str, Outcome | None, Outcome | None, float]
+"""The part that two outcomes tell by their difference, times a factor."""
 
-    def __init__(self, study: Study, reference: Reference, point: Point) -> None:
+
+class _Separator:
+    """The runs that separate the errors of one setting: those of its algebra and its model, and others by its kind."""
+
+    def __init__(self, study: Study, mesh: MeshControl, reference: Reference, point: Point, algebra: dict) -> None:
         self.study = study
         self.reference = reference
         self.point = point
+        self.kinds = {name: kind_of(name, mesh) for name, _ in point.setting}
+        self.shared = reference.ladders["space"][0].setting  # the coarsest mesh and the step of all meshes
+        self.algebra = point.setting.changed(**algebra)
+        model = self._own("model")
+        self.model = self.shared.changed(**model) if model else None
 
     def needed(self) -> list[Setting]:
         """What has to be run."""
-        raise NotImplementedError
+        return [own for own in (*self._runs(), self.algebra, self.model) if own is not None]
 
     def parts(self) -> dict[str, Errors]:
         """The parts, once that has been run."""
+        pairs = [*self._pairs(), ("algebra", self.point.first, self._outcome(self.algebra), 1.0)]
+        if self.model is not None:
+            pairs.append(("model", self._outcome(self.model), self._outcome(self.shared), 1.0))
+        return {
+            kind: self._errors(one, other, factor)
+            for kind, one, other, factor in pairs
+            if one is not None and other is not None
+        }
+
+    def _runs(self) -> list[Setting]:
         raise NotImplementedError
+
+    def _pairs(self) -> list[Pair]:
+        raise NotImplementedError
+
+    def _own(self, kind: str) -> dict[str, str]:
+        """What the setting says of a kind."""
+        return {name: value for name, value in self.point.setting if self.kinds[name] == kind}
 
     def _outcome(self, setting: Setting) -> Outcome | None:
         (point,) = self.study.solve([setting])
         return None if point.failure else point.first
 
-    def _errors(self, one: Outcome, other: Outcome, factor: float = 1.0) -> Errors:
+    def _errors(self, one: Outcome, other: Outcome, factor: float) -> Errors:
         found = relative(difference(one, other), self.reference.scales)
         return {name: factor * value for name, value in found.items()}
 
 
 class _Implicit(_Separator):
     def __init__(self, study: Study, mesh: MeshControl, reference: Reference, point: Point) -> None:
-        super().__init__(study, reference, point)
-        shared = reference.ladders["space"][0].setting  # the coarsest mesh and the step of all meshes
-        in_time = {name for name, _ in shared if name not in mesh.names and name != f"{FORCED}element"}
-        kinds = {name: kind_of(name, mesh) for name, _ in point.setting}
-
-        def own(kind: str) -> dict[str, str]:
-            return {name: value for name, value in point.setting if kinds[name] == kind}
-
-        self.space = shared.only(in_time).changed(**own("space"))
+        super().__init__(study, mesh, reference, point, FINE_ALGEBRA)
+        in_time = {name for name, _ in self.shared if name not in mesh.names and name != f"{FORCED}element"}
+        self.space = self.shared.only(in_time).changed(**self._own("space"))
         plain = dict.fromkeys((f"{FORCED}solver", f"{FORCED}dt"))
-        self.time = shared.changed(**plain).changed(**own("time")) if own("time") else shared.changed(**plain)
-        self.algebra = point.setting.changed(**FINE_ALGEBRA)
-        self.model = shared.changed(**own("model")) if own("model") else None
-        self.shared = shared
+        self.time = self.shared.changed(**plain).changed(**self._own("time"))
 
-    def needed(self) -> list[Setting]:
-        return [own for own in (self.space, self.time, self.algebra, self.model) if own is not None]
+    def _runs(self) -> list[Setting]:
+        return [self.space, self.time]
 
-    def parts(self) -> dict[str, Errors]:
-        limits, found = self.reference.limits, {}
-        pairs: list[tuple[str, Outcome | None, Outcome | None]] = [
-            ("space", self._outcome(self.space), limits["space"]),
-            ("time", self._outcome(self.time), limits["time"]),
-            ("algebra", self.point.first, self._outcome(self.algebra)),
+    def _pairs(self) -> list[Pair]:
+        limits = self.reference.limits
+        return [
+            ("space", self._outcome(self.space), limits["space"], 1.0),
+            ("time", self._outcome(self.time), limits["time"], 1.0),
         ]
-        if self.model is not None:
-            pairs.append(("model", self._outcome(self.model), self._outcome(self.shared)))
-        for kind, one, other in pairs:
-            if one is not None and other is not None:
-                found[kind] = self._errors(one, other)
-        return found
 
 
 class _Explicit(_Separator):
     def __init__(self, study: Study, mesh: MeshControl, reference: Reference, point: Point, solver: Solver) -> None:
-        super().__init__(study, reference, point)
-        self.order = solver.order
-        model = {name: value for name, value in point.setting if kind_of(name, mesh) == "model"}
+        algebra = FINE_ALGEBRA if isinstance(solver, ImplicitSolver) else {"dtype": "float64"}
+        super().__init__(study, mesh, reference, point, algebra)
+        self.rest = 0.5**solver.order
         self.halved = point.setting.changed(**{f"{FORCED}dt": repr(0.5 * point.first.shortest_dt)})
-        self.space = self.halved.changed(**dict.fromkeys(model))
-        self.algebra = point.setting.changed(
-            **(FINE_ALGEBRA if isinstance(solver, ImplicitSolver) else {"dtype": "float64"})
-        )
-        self.shared = reference.ladders["space"][0].setting
-        self.model = self.shared.changed(**model) if model else None
+        self.space = self.halved.changed(**dict.fromkeys(self._own("model")))
 
-    def needed(self) -> list[Setting]:
-        return [own for own in (self.halved, self.space, self.algebra, self.model) if own is not None]
+    def _runs(self) -> list[Setting]:
+        return [self.halved, self.space]
 
-    def parts(self) -> dict[str, Errors]:
-        found = {}
-        halved, space, exact = (self._outcome(own) for own in (self.halved, self.space, self.algebra))
-        if space is not None:
-            found["space"] = self._errors(space, self.reference.outcome)
-        if halved is not None:
-            found["time"] = self._errors(self.point.first, halved, 1.0 / (1.0 - 0.5**self.order))
-        if exact is not None:
-            found["algebra"] = self._errors(self.point.first, exact)
-        if self.model is not None:
-            changed, shared = self._outcome(self.model), self._outcome(self.shared)
-            if changed is not None and shared is not None:
-                found["model"] = self._errors(changed, shared)
-        return found
+    def _pairs(self) -> list[Pair]:
+        return [
+            ("space", self._outcome(self.space), self.reference.outcome, 1.0),
+            ("time", self.point.first, self._outcome(self.halved), 1.0 / (1.0 - self.rest)),
+        ]
 
 
 def _separator(study: Study, mesh: MeshControl, reference: Reference, point: Point) -> _Separator:
