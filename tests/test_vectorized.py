@@ -153,6 +153,24 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         assert limit == results[0][2]
 
 
+def test_threads_look_for_the_stability_limit_in_all_cells(monkeypatch):
+    monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
+    mesh, limits = MESHES["box"], []
+    for threads in (1, 3):
+        model = wf.Model(_scene(mesh, wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu", threads=threads)
+        assert model.team.size == threads
+        stepper, state = wf.SymplecticEuler().stepper(model), model.state()
+        limits.append([stepper.estimate_stable_dt(state)])
+        for cell in (0, mesh.cell_count // 2, mesh.cell_count - 1):  # one is larger, and so stiffer, than all others
+            u = np.zeros_like(mesh.points)
+            corners = mesh.cells[cell]
+            u[corners] = 0.5 * (mesh.points[corners] - mesh.points[corners].mean(axis=0))
+            state.assign(displacement=u)
+            limits[-1] += [stepper.estimate_stable_dt(state), stepper.stable_dt(state)]
+    assert limits[0] == limits[1]
+    assert max(limits[0][1:]) < 0.99 * limits[0][0]
+
+
 def test_steps_of_vectorised_bodies_follow_those_of_plain_ones(monkeypatch):
     motions = []
     for least in (1, 10**9):
