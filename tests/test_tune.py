@@ -260,7 +260,7 @@ def test_the_command_writes_settings_that_run_takes(bar, tmp_path, monkeypatch, 
     assert found["estimate"]["error"] + found["estimate"]["band"] <= 0.02
     path = tmp_path / "output" / "bar.settings.toml"
     own = tomllib.loads(path.read_text())
-    assert own["scene"] == "bar.py" and own["parameters"]["E"] == 2e5
+    assert own["scene"] == "bar.py" and own["parameters"]["E"] == "2e5"
     assert own["changes"]["solver"] == "velocity_verlet"
     assert own["estimate"]["command"] == f"warpfem tune {bar} --error 0.02 --set E=2e5"
     choice = SettingsFile.read(path).choose(path, bar, {})
@@ -308,13 +308,24 @@ def test_settings_come_back_as_they_were_written(bar, settings):
     text = settings.read_text()
     assert text.startswith("# for people\n") and "cells = 3\n" in text and 'dt = "1/60"' in text
     read = SettingsFile.read(settings)
-    assert read.parameters == {"E": "300000.0", "cells": "3"}
+    assert read.parameters == {"E": "3e5", "cells": "3"}
     assert read.notes["estimate"] == {"error": 0.008, "quantity": "l2"}
     choice = read.choose(settings, bar, {})
     scene, body = choice.scene, choice.scene.bodies[0]
     assert (choice.dtype, scene.solver.name, scene.solver.tolerance) == ("float64", "sdirk2", 1e-3)
     assert (scene.dt, body.element) == (pytest.approx(1 / 60), "quadratic")
     assert body.mesh.cell_count == 2 * 6 * 3 and body.material.E == pytest.approx(3e5)
+
+
+TEXTS = ["3", "-2.5", "1e-05", "3e5", "1.50", "007", "1e400", "9" * 30, "9" * 5000, "-0", "true", "True", "nan", "[3]", "1/60"]
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text[:8])
+def test_texts_come_back_as_they_are(bar, tmp_path, text):
+    path = tmp_path / "texts.toml"
+    SettingsFile("bar.py", "", {"kind": text}, {"dt": text}).write(path, [])
+    read = SettingsFile.read(path)
+    assert (read.parameters, read.changes) == ({"kind": text}, {"dt": text})
 
 
 def test_the_command_line_wins_over_settings(bar, settings):

@@ -80,10 +80,31 @@ class Contenders:
     @property
     def tried(self) -> set[Setting]:
         """All settings that were tried."""
-        return self.trials.tried | self.coarse.tried
+        return self.trials.tried.keys() | self.coarse.tried.keys()
 
-    def within(self, goal: float, excluded: Collection[Setting] = ()) -> list[Trial]:
-        """The cheapest settings whose error is within a goal, but for some; from fast to slow."""
+    def within(self, goal: float, hopeless: float, excluded: Collection[Setting] = ()) -> list[Trial]:
+        """The cheapest settings that may have the error wanted over all frames, but for some; from fast to slow.
+
+        Args:
+            goal: the error, on the frames of the trials, of those that are sought.
+            hopeless: that above which none has the error wanted over all frames. What has been tried, has less, and is
+                cheaper than all that was found, is given too.
+            excluded: settings that are not given.
+        """
+        found = self._within(goal, excluded)
+        return self._cheaper(FASTER * _least(found), hopeless, excluded) + found
+
+    def _cheaper(self, seconds: float, most: float, excluded: Collection[Setting]) -> list[Trial]:
+        """What was tried and takes less time, errs by no more, and of which none is both faster and more accurate."""
+        tried = {t.setting: t for t in self.trials.tried.values() if t.seconds < seconds and t.error <= most}
+        front: list[Trial] = []
+        for trial in sorted((t for t in tried.values() if t.setting not in excluded), key=lambda t: t.seconds):
+            if not front or trial.error < front[-1].error:
+                front.append(trial)
+        return front[-CONTENDERS:]
+
+    def _within(self, goal: float, excluded: Collection[Setting]) -> list[Trial]:
+        """The cheapest settings whose error on the frames of the trials is within a goal."""
         found: list[Trial] = []
         if self.explicit:
             for base in self._by_promise([_with(EXPLICIT, element) for element in self._elements()], goal):

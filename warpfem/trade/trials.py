@@ -79,15 +79,16 @@ class Trials:
         self.reference = reference
         self.scales = scales
         self.name = name
-        self.tried: set[Setting] = set()
+        self.tried: dict[Setting, Trial] = {}
 
     def run(self, settings: Sequence[Setting]) -> list[Trial]:
         """Tries settings; what float32 does not resolve, in float64."""
-        self.tried |= set(settings)
         points = self.study.run(settings)
         again = {p.setting: p.setting.changed(dtype="float64") for p in points if _asks_for_digits(p)}
         wider = dict(zip(again, self.study.run(list(again.values())), strict=True))
-        return [self._trial(wider.get(point.setting, point)) for point in points]
+        trials = [self._trial(wider.get(point.setting, point)) for point in points]
+        self.tried |= dict(zip(settings, trials, strict=True))
+        return trials
 
     def one(self, setting: Setting) -> Trial:
         """Tries a setting."""
