@@ -41,15 +41,16 @@ def scene(cells: int = 4, E: float = 1e5, dt: float = 1 / 40) -> wf.Scene:
 # ---- the search for one level
 
 
-def levels(constant: float, power: float, cost: float = 1.0, failing: int = 0):
-    """Trials of n steps of a frame with an error of constant n^-power; those of few steps fail."""
+def levels(constant: float, power: float, cost: float = 1.0, failing: int = 0, rounding: float = 0.0):
+    """Trials of n steps of a frame with an error of constant n^-power, and rounding in float32; of few steps they fail."""
 
     def run(setting: Setting) -> Trial:
         steps = steps_of(setting, 10.0)
         run.tried.append(steps)
         failed = steps <= failing
         outcome = Outcome("diverged" if failed else "", seconds=[cost * steps])
-        return Trial(setting, Point(setting, (outcome,)), np.inf if failed else constant * steps**-power)
+        error = constant * steps**-power + (0.0 if "dtype" in setting else rounding)
+        return Trial(setting, Point(setting, (outcome,)), np.inf if failed else error)
 
     run.tried = []
     return run
@@ -86,7 +87,13 @@ def test_levels_that_fail_are_refined():
 def test_a_search_whose_errors_do_not_fall_ends():
     run = levels(1.0, 0.01)
     assert search(run, 1e-2, 1.0) is None
-    assert len(run.tried) == 3
+    assert len(run.tried) == 4  # the last in float64
+
+
+def test_a_search_that_float32_stops_goes_on_in_float64():
+    run = levels(1.0, 1.0, rounding=2e-2)
+    assert 100 <= search(run, 1e-2, 1.0, start=40) <= 130
+    assert len(run.tried) <= 10
 
 
 def test_a_search_that_would_cost_too_much_ends():
@@ -217,6 +224,15 @@ def test_what_is_found_is_within_the_error_at_little_more_than_the_least_cost(
     assert runs < 80 < (law.runs - runs) / 3.0  # settings of the sweep
     if late == 4.0:
         assert found.seen < found.unseen
+
+
+def test_what_errs_more_only_on_the_frames_of_the_search_is_found(bar, monkeypatch):
+    law = Law(5.0, late=0.1)
+    study = study_of(bar, law, monkeypatch)
+    found = tune(study, mesh_control(study.problem), "l2", 0.003, repeats=1)
+    assert found.unseen < 0.003 < found.seen
+    assert true_error(found.point.first, "l2") <= 0.003
+    assert found.point.seconds <= 1.2 * sweep(study, law, 0.003, "l2")
 
 
 def test_tuning_that_was_interrupted_goes_on(bar, monkeypatch):
