@@ -42,7 +42,7 @@ def scene(cells: int = 4, E: float = 1e5, dt: float = 1 / 40) -> wf.Scene:
 
 
 def levels(constant: float, power: float, cost: float = 1.0, failing: int = 0, rounding: float = 0.0):
-    """Trials of n steps of a frame with an error of constant n^-power; those of few steps fail, float32 errs by more."""
+    """Trials of n steps of a frame with an error of constant n^-power; those of few steps fail, float32 errs more."""
 
     def run(setting: Setting) -> Trial:
         steps = steps_of(setting, 10.0)
