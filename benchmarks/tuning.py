@@ -245,7 +245,8 @@ def _short(label: str) -> str:
 
 
 def _machine(own: dict) -> str:
-    return f"{own['processor']}, {own['cores']} cores, warpfem {own['warpfem']}, warp {own['warp']}"
+    cores = "one core" if own["cores"] == 1 else f"{own['cores']} cores"
+    return f"{own['processor']}, {cores}, warpfem {own['warpfem']}, warp {own['warp']}"
 
 
 def _sentence(text: str) -> str:

@@ -16,6 +16,7 @@ from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.commands.tune import _tune_command
 from warpfem.errors import SceneError, SimulationError
 from warpfem.motion import Motion
+from warpfem.solvers import Quasistatic
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import mesh_control
 from warpfem.trade.outcome import Order, Outcome
@@ -113,10 +114,19 @@ class Law:
         late: by what errors grow after half of the frames.
         noise: errors that no refinement reduces.
         opposed: the part of the errors in time that makes up for those in space.
+        inertia: the error of equilibria in place of motion.
     """
 
-    def __init__(self, stiffness: float = 20.0, late: float = 1.0, noise: float = 0.0, opposed: float = 0.0) -> None:
+    def __init__(
+        self,
+        stiffness: float = 20.0,
+        late: float = 1.0,
+        noise: float = 0.0,
+        opposed: float = 0.0,
+        inertia: float = 1.0,
+    ) -> None:
         self.stiffness, self.late, self.noise, self.opposed = stiffness, late, noise, opposed
+        self.inertia = inertia
         self.runs = 0
 
     def __call__(self, order: Order) -> Outcome:
@@ -133,6 +143,8 @@ class Law:
             steps = scene.frames * max(1, round(interval / scene.dt))
             in_time = {1: 1.0, 2: 0.3, 3: 0.15}[solver.order] * (scene.frames * interval / steps) ** solver.order / 0.05
             seconds = steps * 1e-3 * (1.0 + 0.1 * work) * solver.order * (0.4 if solver.max_iterations == 1 else 1.0)
+        elif isinstance(solver, Quasistatic):
+            steps, in_time, seconds = scene.frames, 20.0 * self.inertia, 1e-3 * (1.0 + 0.1 * work)
         else:
             steps = round(scene.frames * self.stiffness * (2 if quadratic else 1) / h)
             in_time = 1e-5
@@ -233,6 +245,18 @@ def test_what_errs_more_only_on_the_frames_of_the_search_is_found(bar, monkeypat
     assert found.unseen < 0.003 < found.seen
     assert true_error(found.point.first, "l2") <= 0.003
     assert found.point.seconds <= 1.2 * sweep(study, law, 0.003, "l2")
+
+
+@pytest.mark.parametrize("inertia", [1e-4, 0.01])
+def test_equilibria_take_the_place_of_motion_only_where_they_are_accurate_enough(bar, monkeypatch, inertia):
+    law = Law(inertia=inertia)
+    study = study_of(bar, law, monkeypatch)
+    found = tune(study, mesh_control(study.problem), "l2", 0.01, repeats=1)
+    assert (found.setting["scene.solver"] == "quasistatic") == (inertia < 0.003)
+    assert true_error(found.point.first, "l2") <= 0.01
+    if inertia < 0.003:
+        assert found.parts["model"] == pytest.approx(inertia, rel=0.3)
+        assert "time" not in found.parts
 
 
 def test_tuning_that_was_interrupted_goes_on(bar, monkeypatch):

@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from warpfem.materials import HookeanMaterial, LinearElasticity
-from warpfem.solvers import SOLVERS, ImplicitMidpoint
+from warpfem.solvers import SOLVERS, ImplicitMidpoint, Quasistatic
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import MeshControl
 from warpfem.trade.ladders import Rung
@@ -109,7 +109,7 @@ class Contenders:
         if self.explicit:
             for base in self._by_promise([_with(EXPLICIT, element) for element in self._elements()], goal):
                 self._add(found, base, goal)
-        levels = [level for level in self._time_levels(goal, found) if level is not None]
+        levels = [level for level in (self._at_rest(goal), *self._time_levels(goal, found)) if level is not None]
         for level in sorted(levels, key=lambda t: t.seconds):
             scheme = dict(level.setting.only({name for name, _ in level.setting} - self.mesh.names))
             bases = [
@@ -193,6 +193,11 @@ class Contenders:
         growth = max(1.0, min(map(self._growth, self.points), default=1.0))
         most = min(PROMISING * _least(found) / growth, self.trials.study.limit)
         return [self._time_level(scheme, order, goal, most) for scheme, order in self._schemes().items()]
+
+    def _at_rest(self, goal: float) -> Trial | None:
+        """Equilibria in place of motion, where that makes little difference on the coarse mesh."""
+        level = self.coarse.one(self._one_step(self.coarse_mesh, Quasistatic.name))
+        return level if level.error <= SIMPLER * goal else None
 
     def _time_level(self, scheme: str, order: float, goal: float, most_seconds: float) -> Trial | None:
         share = (1.0 / order) / (1.0 / order + (self.scene.dim + 0.5) / MEAN_ORDER)
