@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from warpfem.model import Model, State
 from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive
 from warpfem.solvers.newton import NewtonSettings
-from warpfem.solvers.static import LINEAR_ITERATIONS, StaticNewton, at_rest, require_solvable
+from warpfem.solvers.static import LINEAR_ITERATIONS, StaticNewton, require_solvable
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _QuasistaticStepper(Stepper):
     def __init__(self, model: Model, config: Quasistatic) -> None:
         require_solvable(model)
         self.model = model
-        self.newton = StaticNewton(at_rest(model), config, static=True)
+        self.newton = StaticNewton(model, config, static=True)
         self._found: tuple[State, int] | None = None  # state and revision that are an equilibrium
 
     @property

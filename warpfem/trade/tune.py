@@ -2,12 +2,14 @@
 
 1. A reference is built whose error band is a part of the error asked for, or the search is refused.
 2. On the first part of the frames the settings are sought that may be the cheapest (:mod:`warpfem.trade.contenders`).
-3. These are run to the end. The frames that the search has not seen show whether they hold; if they do not, or are far
-   more accurate than asked, the search is repeated for a smaller or larger error.
+3. These are run to the end, and what is cheaper and may be within the error over all frames. The frames that the search
+   has not seen show whether they hold; if they do not, or are far more accurate than asked, the search is repeated for
+   a smaller or larger error.
 4. Of the one that is left the tolerance is loosened, as far as that makes it faster and its error allows it.
 
-Linear elasticity takes the place of another law only where the difference that it makes on a coarse mesh is a small
-part of the error asked for, and where it is faster. Other models, such as plane strain, are a scene's own to offer.
+Linear elasticity takes the place of another law, and equilibria that of motion, only where the difference that this
+makes on a coarse mesh is a small part of the error asked for, and where it is faster. Other models, such as plane
+strain, are a scene's own to offer.
 """
 
 from __future__ import annotations
