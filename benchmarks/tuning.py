@@ -50,19 +50,28 @@ class Case:
         errors: relative, of the motion.
         cells: values of its parameter ``cells`` in the sweep.
         true_cells: that of the true motion, of quadratic cells.
+        parameters: other values of the scene's parameters, as text.
+        limit: wall time of a run [s].
     """
 
     scene: str
     errors: tuple[float, ...]
     cells: tuple[int, ...]
     true_cells: int
+    parameters: tuple[tuple[str, str], ...] = ()
+    limit: float = 100.0
+
+    @property
+    def problem(self) -> Problem:
+        """The scene with its parameters."""
+        return Problem.of(SCENES / f"{self.scene}.py", dict(self.parameters))
 
 
 CASES = (
     Case("cantilever", (0.1, 0.01), (1, 2, 4, 8), 6),
     Case("twist", (0.1, 0.01), (1, 2, 4, 8), 6),
-    Case("jelly_drop", (0.1,), (2, 3, 6, 12), 14),
-    Case("stretch", (0.1, 0.01), (1, 2, 4, 8), 8),
+    Case("jelly_drop", (0.1,), (2, 3, 6, 12), 14, (("stiffness", "4e6"),)),  # by default it goes with the cells
+    Case("stretch", (0.1, 0.01), (1, 2, 4, 8), 8, limit=200.0),
     Case("two_materials", (0.1, 0.01), (1, 2, 4, 8), 8),
     Case("custom_material", (0.1, 0.01), (1, 2, 4, 8), 12),
 )
@@ -83,7 +92,7 @@ def sweep_settings(case: Case) -> list[Setting]:
 
 
 def fps_of(case: Case) -> int:
-    return round(Problem.of(SCENES / f"{case.scene}.py").build(Setting()).scene.fps)
+    return round(case.problem.build(Setting()).scene.fps)
 
 
 def true_setting(case: Case) -> Setting:
@@ -92,31 +101,31 @@ def true_setting(case: Case) -> Setting:
     return Setting.of(cells=case.true_cells, dtype="float64", **{f"{FORCED}{name}": v for name, v in own.items()})
 
 
-def measure(case: Case, target: float, folder: Path, limit: float, repeats: int) -> dict:
+def measure(case: Case, target: float, folder: Path, repeats: int) -> dict:
     """Tunes, sweeps and compares.
 
     Args:
         case: the scene.
         target: the relative error.
         folder: of runs.
-        limit: wall time of a run [s].
         repeats: processes that time what was found, and the best of the sweep.
     """
 
     def say(text: str) -> None:
         print(f"  {text}", flush=True)
 
-    problem = Problem.of(SCENES / f"{case.scene}.py")
+    problem = case.problem
     with local_executor(1) as pool:
-        study = Study(problem, Store(folder / case.scene), pool, limit=limit, say=say)
+        study = Study(problem, Store(folder / case.scene), pool, limit=case.limit, say=say)
         start = time.perf_counter()
-        record: dict = {"scene": case.scene, "error": target, "machine": facts()}
+        scene = " ".join([case.scene, *(f"{name}={value}" for name, value in case.parameters)])
+        record: dict = {"scene": scene, "error": target, "machine": facts()}
         try:
             found = tune(study, mesh_control(problem), "l2", target, repeats=repeats)
         except SimulationError as error:
             return record | {"refusal": str(error)}
         record |= {"tuning_seconds": time.perf_counter() - start, "tried": found.tried}
-        patient = Study(problem, study.store, pool, limit=10.0 * limit, say=say)
+        patient = Study(problem, study.store, pool, limit=10.0 * case.limit, say=say)
         (true,) = patient.solve([true_setting(case)])
         if true.failure:
             return record | {"refusal": f"no true motion: {true.failure}"}
@@ -166,7 +175,6 @@ def main() -> None:
     parser.add_argument("--case", action="append", default=[], metavar="SCENE[:E]", help="only these")
     parser.add_argument("--out", type=Path, default=Path("docs/tuning.md"), help="the page (default: %(default)s)")
     parser.add_argument("--folder", type=Path, default=Path("output/tuning"), help="of runs (default: %(default)s)")
-    parser.add_argument("--limit", type=float, default=100.0, help="wall time of a run [s] (default: %(default)s)")
     parser.add_argument("--repeats", type=int, default=3, help="processes that time each (default: %(default)s)")
     arguments = parser.parse_args()
     kept = arguments.out.with_suffix(".json")
@@ -175,7 +183,7 @@ def main() -> None:
         name = name_of(case, target)
         if arguments.case and not {case.scene, name} & set(arguments.case):
             continue
-        records[name] = measure(case, target, arguments.folder, arguments.limit, arguments.repeats)
+        records[name] = measure(case, target, arguments.folder, arguments.repeats)
         print(row(records[name]), flush=True)
         kept.write_text(json.dumps(records, indent=2) + "\n")
         arguments.out.write_text(page(records))
