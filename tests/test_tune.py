@@ -1,7 +1,9 @@
 """Tuning: the search for the cheapest setting within an error, and the files of settings."""
 
+import importlib.util
 import json
 import shlex
+import sys
 import tomllib
 import zlib
 from concurrent.futures import Executor, Future
@@ -468,6 +470,16 @@ def test_run_and_static_take_settings(bar, settings, tmp_path, capsys):
     assert (summary["steps"], summary["dtype"]) == (3, "float32")
     assert main([*run, "--overwrite", "--json", "--set", "dt=0.05"]) == OK
     assert json.loads(capsys.readouterr().out)["steps"] == 1
+
+
+def test_the_page_of_the_benchmark_is_that_of_its_results(monkeypatch):
+    root = Path(__file__).parent.parent
+    spec = importlib.util.spec_from_file_location("tuning", root / "benchmarks" / "tuning.py")
+    benchmark = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "tuning", benchmark)
+    spec.loader.exec_module(benchmark)
+    results = json.loads((root / "docs" / "tuning.json").read_text())
+    assert benchmark.page(results) == (root / "docs" / "tuning.md").read_text()
 
 
 @pytest.mark.slow
