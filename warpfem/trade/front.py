@@ -19,7 +19,7 @@ RESOLVED = 0.25
 """The largest part of an error that the reference's band may be for the error to be more than a bound."""
 
 
-TAIL = 30.0
+TAIL = 10.0
 """Errors over the smallest one of a front that belong to the part that is extrapolated."""
 
 LEAST_TAIL = 3
