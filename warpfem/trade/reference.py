@@ -33,7 +33,7 @@ COARSE_TOLERANCE = "1e-6"
 L2, LARGEST = "l2", "max"
 """The two norms over the trajectory, among the names of what errors are measured of."""
 
-MOST_LEVELS = 6
+MOST_LEVELS = 9
 """Levels of a ladder beyond which a finer one is not the answer."""
 
 DEFAULT_STIFFNESS = (
