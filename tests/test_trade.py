@@ -555,7 +555,7 @@ import warpfem as wf
 def scene(cells: int = 2, stiffness: float | None = 1e6) -> wf.Scene:
     mesh = wf.Mesh.rectangle((1, 1), (cells, cells), origin=(0, 0.05))
     block = wf.Body("block", mesh, wf.LinearElasticity(E=1e5, nu=0.3))
-    floor = wf.Plane(point=(0, 0), normal=(0.1, 1), stiffness=stiffness)
+    floor = wf.Plane(point=(0, 0), normal=(0.1, 1), friction=0.3, stiffness=stiffness)
     return wf.Scene([block], wf.BackwardEuler(), gravity=(0, -9.81), damping=2.0, fps=20, frames=12, obstacles=[floor])
 """
 
