@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from warpfem.child import noting_files
 from warpfem.errors import OutputError, described
 from warpfem.places import spread_places
 from warpfem.trade.machine import facts
@@ -109,7 +110,6 @@ class Study:
         threads: int | None = None,
         say: Say = lambda text: None,
     ) -> None:
-        self.problem = problem
         self.store = store
         self.load = load
         self.limit = limit
@@ -118,8 +118,10 @@ class Study:
         self._executor = executor
         self._machine = facts()
         self._given_up: set[Setting] = set()
-        self.scene = problem.build(Setting()).scene
-        self.places = store.places(problem, self._spread)
+        with noting_files() as files:
+            self.scene = problem.build(Setting()).scene
+        self.problem = problem.reading(files)
+        self.places = store.places(self.problem, self._spread)
 
     def _spread(self) -> list[np.ndarray]:
         volumes = np.array([body.mesh.cell_volumes.sum() for body in self.scene.bodies])
