@@ -68,6 +68,7 @@ def test_registry_names_the_solvers():
         "implicit_midpoint": 2,
         "sdirk2": 2,
         "sdirk3": 3,
+        "quasistatic": 0,
     }
 
 

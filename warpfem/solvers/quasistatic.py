@@ -20,7 +20,7 @@ class Quasistatic(NewtonSettings, Solver):
     linear_iterations: int = LINEAR_ITERATIONS
 
     name = "quasistatic"
-    order = 0
+    order = 0  # shorter steps do not lead to motion with inertia
 
     def stepper(self, model: Model) -> Stepper:
         return _QuasistaticStepper(model, self)
