@@ -13,8 +13,9 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.launches import Recordings, jobs
 from warpfem.model import Model
-from warpfem.stiffness import pair_count
+from warpfem.stiffness import CHUNK, entry_count, entry_numbers
 from warpfem.threads import Job, share
+from warpfem.vectorized_stiffness import VectorizedStiffness, can_vectorize
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ def find_pattern(model: Model, diagonal_only: bool = False) -> Pattern:
     for block in model.blocks:
         corners = block.shape.point_count
         a, b = np.triu_indices(corners)
-        entry = offset + np.arange(block.count)[:, None] * len(a) + np.arange(len(a))
-        offset += entry.size
+        entry = offset + entry_numbers(block.count, corners)
+        offset += entry_count(block.count, corners)
         if diagonal_only:
             a, b, entry = a[a == b], b[a == b], entry[:, a == b]
         i, j = block.host_cells[:, a].astype(np.int64), block.host_cells[:, b].astype(np.int64)
@@ -99,10 +100,11 @@ class Assembly:
         indices = {name: wp.array(data, dtype=wp.int32, device=model.device) for name, data in vars(pattern).items()}
         self.row_starts, self.columns, self.diagonal, *self._sums = indices.values()
         self.blocks = self._new_blocks(len(pattern.columns))
-        counts = [block.count * pair_count(block.shape.point_count) for block in model.blocks]
+        counts = [entry_count(block.count, block.shape.point_count) for block in model.blocks]
         self._entries = self._new_blocks(sum(counts))
         ends = np.cumsum(counts).tolist()
         self._parts = [self._entries[end - count : end] for end, count in zip(ends, counts, strict=True)]
+        self._vectorized = [VectorizedStiffness(block) if can_vectorize(block) else None for block in model.blocks]
         self._free = free
         self._recordings = Recordings()
 
@@ -126,10 +128,13 @@ class Assembly:
         """The launches of the cells' entries, then those that sum them up, divided among threads."""
         model, size = self.model, self.model.team.size
         cells: list[list[wp.Launch | None]] = [[] for _ in range(size)]
-        for block, entries in zip(model.blocks, self._parts, strict=True):
-            pairs = pair_count(block.shape.point_count)
-            for launches, part in zip(cells, share(block.count, size), strict=True):
-                out = entries[part.start * pairs : part.stop * pairs]
+        for block, vectorized, entries in zip(model.blocks, self._vectorized, self._parts, strict=True):
+            corners = block.shape.point_count
+            for launches, part in zip(cells, share(block.count, size, CHUNK), strict=True):
+                if vectorized is not None and kernel == "stiffness":
+                    launches += vectorized.record(u, entries, part)
+                    continue
+                out = entries[entry_count(part.start, corners) : entry_count(part.stop, corners)]
                 launches.append(block.launch(kernel, [u], [out], part=slice(part.start, part.stop), record=True))
         inputs = [
             *(self.row_starts, self.columns, self.diagonal, *self._sums),
@@ -150,7 +155,8 @@ class Assembly:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [self.row_starts, self.columns, self.diagonal, *self._sums, self.blocks, self._entries]
+        own = [self.row_starts, self.columns, self.diagonal, *self._sums, self.blocks, self._entries]
+        return [*own, *(array for each in self._vectorized if each is not None for array in each.arrays())]
 
 
 @functools.cache
