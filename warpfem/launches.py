@@ -16,6 +16,9 @@ MOST_RECORDED = 8
 MOST_KEPT = 256
 """Launches that a launcher keeps: a step of an implicit scheme has some tens of different ones."""
 
+MOST_SINGLE = 8
+"""Launches of one thread up to which a graph of them, each of which costs a tenth, is not worth its making."""
+
 Recording = TypeVar("Recording")
 
 
@@ -102,7 +105,9 @@ def jobs(
 
     def job(own: list[wp.Launch], around: AbstractContextManager) -> Job:
         replays: list[Callable[[], Any]] = [each.launch for each in own]
-        if len(launches) > 1 and own:  # a graph takes Python's lock once, for which threads wait
+        if own and (
+            len(launches) > 1 or len(own) > MOST_SINGLE
+        ):  # a graph takes Python's lock, for which threads wait, once
             with wp.ScopedCapture(device=own[0].device) as capture:
                 for each in own:
                     each.launch()

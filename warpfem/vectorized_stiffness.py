@@ -79,7 +79,7 @@ class _Readers:
 
         @wp.func
         def rotation(rotations: wp.array(dtype=scalar), first: int, lane: int):
-            """Of cell ``first + lane``, the first of whose chunk is ``first``."""
+            """Of cell ``first + lane`` of those that have been turned, the first of a chunk being ``first``."""
             value = matrix()
             for m in range(wp.static(dim)):
                 for k in range(wp.static(dim)):
@@ -106,8 +106,9 @@ def _rotation_kernel(dim: int, dtype: str) -> wp.Kernel:
         u: wp.array(dtype=vector),
         rotations_out: wp.array(dtype=scalar),
     ):
-        """Writes the rotations of the cells of a chunk, entry by entry, the cells innermost."""
-        first = (first_chunk + wp.tid()) * CHUNK
+        """Writes the rotations of the cells of chunk ``first_chunk + tid``, entry by entry, the cells innermost."""
+        chunk = wp.tid()
+        first = (first_chunk + chunk) * CHUNK
         last = cells.shape[0] - 1
         points = wp.array(ptr=cells.ptr, shape=(0,), dtype=wp.int32)
         B = wp.array(ptr=inverse_shape.ptr, shape=(0,), dtype=scalar)
@@ -123,8 +124,9 @@ def _rotation_kernel(dim: int, dtype: str) -> wp.Kernel:
                 for k in range(wp.static(dim)):
                     rotations[(m * wp.static(dim) + k) * CHUNK + lane] = R[m, k]
         out = wp.array(ptr=rotations_out.ptr, shape=(0,), dtype=scalar)
+        target = chunk * wp.static(dim * dim * CHUNK)
         for entry in range(wp.static(dim * dim * CHUNK)):
-            out[first * wp.static(dim * dim) + entry] = rotations[entry]
+            out[target + entry] = rotations[entry]
         for place in range(CHUNK):
             if known[place] == scalar(0.0):
                 own = wp.min(first + place, last)
@@ -133,7 +135,7 @@ def _rotation_kernel(dim: int, dtype: str) -> wp.Kernel:
                 )
                 for m in range(wp.static(dim)):
                     for k in range(wp.static(dim)):
-                        out[first * wp.static(dim * dim) + (m * wp.static(dim) + k) * CHUNK + place] = exact[m, k]
+                        out[target + (m * wp.static(dim) + k) * CHUNK + place] = exact[m, k]
 
     return cell_rotations
 
@@ -197,9 +199,10 @@ def _column_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: bo
         rotations: wp.array(dtype=scalar),
         entries_out: wp.array(dtype=matrix),
     ):
-        """Writes the blocks K_ab, a <= b, of the cells of a chunk."""
+        """Writes the blocks K_ab, a <= b, of the cells of chunk ``first_chunk + tid // corners`` for one b."""
         task = wp.tid()
-        first = (first_chunk + task // wp.static(corners)) * CHUNK
+        own_first = task // wp.static(corners) * CHUNK
+        first = first_chunk * CHUNK + own_first
         b = task % wp.static(corners)
         last = cells.shape[0] - 1
         points = wp.array(ptr=cells.ptr, shape=(0,), dtype=wp.int32)
@@ -215,7 +218,7 @@ def _column_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: bo
             H = read_displacement_gradient(points, displacements, cell, gradients)
             R = matrix()
             if wp.static(rotated):
-                R = read_rotation(own_rotations, first, lane)
+                R = read_rotation(own_rotations, own_first, lane)
             weighted = volumes[cell] * corner_gradient(gradients, b)
             own = column(H, R, gradients, weighted, read_parameters(p, cell))
             for row in range(wp.static(corners * dim)):
@@ -224,7 +227,7 @@ def _column_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: bo
         out = wp.array(ptr=entries_out.ptr, shape=(0,), dtype=scalar)
         for a in range(b + 1):
             pair = a * wp.static(corners) - a * (a - 1) // 2 + b - a
-            target = (first * wp.static(pairs) + pair * CHUNK) * wp.static(dim * dim)
+            target = (own_first * wp.static(pairs) + pair * CHUNK) * wp.static(dim * dim)
             source = a * wp.static(dim * dim * CHUNK)
             for place in range(CHUNK):
                 for e in range(wp.static(dim * dim)):
@@ -238,9 +241,11 @@ class VectorizedStiffness:
 
     Args:
         block: the cells.
+        most_cells: cells of a launch at most.
+        threads: whose launches may run at the same time.
     """
 
-    def __init__(self, block: CellBlock) -> None:
+    def __init__(self, block: CellBlock, most_cells: int, threads: int) -> None:
         self._block = block
         kernels = block.kernels
         dtype = "float32" if kernels.types.scalar is wp.float32 else "float64"
@@ -248,22 +253,28 @@ class VectorizedStiffness:
         self._corners = kernels.dim + 1
         self._columns = _column_kernel(kernels.constitutive, kernels.dim, dtype, uniform)
         self._turn = None if kernels.constitutive.rotated_differential is None else _rotation_kernel(kernels.dim, dtype)
-        size = 0 if self._turn is None else -(-block.count // CHUNK) * CHUNK * kernels.dim**2
-        self._rotations = wp.empty(size, dtype=kernels.types.scalar, device="cpu")
+        size = 0 if self._turn is None else -(-most_cells // CHUNK) * CHUNK * kernels.dim**2
+        self._rotations = [wp.empty(size, dtype=kernels.types.scalar, device="cpu") for _ in range(threads)]
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [self._rotations]
+        return self._rotations
 
-    def record(self, u: wp.array, entries_out: wp.array, cells: range) -> list[wp.Launch]:
-        """The launches, in their order, that write the stiffness at ``u`` of a range of cells, of whole chunks."""
-        if not cells:
-            return []
+    def record(self, u: wp.array, entries_out: wp.array, cells: range, thread: int) -> list[wp.Launch]:
+        """The launches, in their order, that write the stiffness of a range of cells, which begins with a chunk.
+
+        Args:
+            u: displacements, device array.
+            entries_out: the blocks of these cells alone (see ``stiffness.py``), device array.
+            cells: the range.
+            thread: which of the threads.
+        """
         first, count = cells.start // CHUNK, -(-len(cells) // CHUNK)
         points, B, *others = (self._block.arguments[n] for n in ("cells", "inverse_shape", "volume", "parameters"))
-        passes = [(self._columns, count * self._corners, [first, points, B, *others, u, self._rotations], entries_out)]
+        rotations = self._rotations[thread]
+        passes = [(self._columns, count * self._corners, [first, points, B, *others, u, rotations], entries_out)]
         if self._turn is not None:
-            passes.insert(0, (self._turn, count, [first, points, B, u], self._rotations))
+            passes.insert(0, (self._turn, count, [first, points, B, u], rotations))
         return [
             wp.launch(kernel, tasks, inputs=inputs, outputs=[out], device="cpu", record_cmd=True)
             for kernel, tasks, inputs, out in passes
