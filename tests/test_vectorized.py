@@ -167,6 +167,9 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         monkeypatch.setattr(f"warpfem.{module}.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
     monkeypatch.setattr(explicit, "WINDOW", 64)
+    monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
+    monkeypatch.setattr("warpfem.linear.operators.SLICED_POINTS", 64)
+    monkeypatch.setattr("warpfem.linear.slices.SLICES_PER_THREAD", 1)
     mesh = MESHES["box"]
     mesh = mesh.with_point_set("bottom", np.flatnonzero(mesh.points[:, 1] == 0.0))
     results = []

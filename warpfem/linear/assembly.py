@@ -5,14 +5,13 @@ the diagonal on, by a list, and writes each block and its transpose: the order o
 not depend on how many tasks run at a time.
 """
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from warpfem.dtypes import types
 from warpfem.launches import Recordings, jobs
+from warpfem.linear.assembly_kernels import assembly_kernels
 from warpfem.linear.cell_sums import CellSums
 from warpfem.model import Model
 from warpfem.threads import Job, share
@@ -122,7 +121,7 @@ class Assembly:
         ]
         rows = [
             wp.launch(
-                _assemble_kernel(model.dim, model.dtype),
+                assembly_kernels(model.dim, model.dtype).assemble,
                 len(part),
                 inputs=[part.start, *inputs],
                 outputs=[self.blocks],
@@ -137,50 +136,3 @@ class Assembly:
         """The device arrays held."""
         own = [self.row_starts, self.columns, self.diagonal, *self._lists, self.blocks, self._parts]
         return [*own, *(array for sums in self._sums for array in sums.arrays())]
-
-
-@functools.cache
-def _assemble_kernel(dim: int, dtype: str) -> wp.Kernel:
-    t = types(dim, dtype)
-    vector, matrix, scalar = t.vector, t.matrix, t.scalar
-
-    @wp.kernel(module=f"warpfem.assembly_{dim}_{dtype}", enable_backward=False)
-    def assemble(
-        first: int,
-        row_starts: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        diagonal: wp.array(dtype=wp.int32),
-        upper_starts: wp.array(dtype=wp.int32),
-        mirror: wp.array(dtype=wp.int32),
-        sum_starts: wp.array(dtype=wp.int32),
-        terms: wp.array(dtype=wp.int32),
-        parts: wp.array(dtype=matrix),
-        mass: wp.array(dtype=scalar),
-        mass_weight: scalar,
-        extra: wp.array(dtype=matrix),
-        free: wp.array(dtype=vector),
-        blocks_out: wp.array(dtype=matrix),
-    ):
-        """Sums parts, mass and the extra blocks on the diagonal; held rows and columns become those of I."""
-        i = first + wp.tid()
-        number = upper_starts[i]
-        for slot in range(diagonal[i], row_starts[i + 1]):
-            total = matrix()
-            for k in range(sum_starts[number], sum_starts[number + 1]):
-                total += parts[terms[k]]
-            j = columns[slot]
-            if j == i:
-                total = scalar(0.5) * (total + wp.transpose(total))
-                total += (mass_weight * mass[i]) * wp.identity(n=dim, dtype=scalar)
-                if extra.shape[0] > 0:
-                    total += extra[i]
-            if free.shape[0] > 0:
-                total = wp.cw_mul(wp.outer(free[i], free[j]), total)
-                if j == i:
-                    total += wp.diag(vector(scalar(1.0)) - free[i])
-            blocks_out[slot] = total
-            if j > i:
-                blocks_out[mirror[number]] = wp.transpose(total)
-            number += 1
-
-    return assemble

@@ -5,13 +5,11 @@ are computed and summed before those of the next, so that several times less goe
 have. The order of every sum is fixed, so that the bits do not depend on how the groups are divided among threads.
 """
 
-import functools
-
 import numpy as np
 import warp as wp
 
-from warpfem.dtypes import types
 from warpfem.launches import Recordings, jobs
+from warpfem.linear.assembly_kernels import assembly_kernels
 from warpfem.model import CellBlock
 from warpfem.stiffness import CHUNK, entry_count, entry_numbers, pair_count
 from warpfem.threads import Job, Team, share
@@ -83,7 +81,7 @@ class CellSums:
     def _record(self, kernel: str, u: wp.array, sums_out: wp.array) -> list[Job]:
         block = self._block
         t = block.kernels.types
-        add_up = _sum_kernel(t.dim, "float32" if t.scalar is wp.float32 else "float64")
+        add_up = assembly_kernels(t.dim, "float32" if t.scalar is wp.float32 else "float64").add_up_cells
         launches: list[list[wp.Launch | None]] = []
         parts = share(len(self._groups), len(self._entries))
         for thread, (part, entries) in enumerate(zip(parts, self._entries, strict=True)):
@@ -107,29 +105,3 @@ class CellSums:
                 )
             launches.append(own)
         return jobs(launches)
-
-
-@functools.cache
-def _sum_kernel(dim: int, dtype: str) -> wp.Kernel:
-    matrix = types(dim, dtype).matrix
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_up_cells(
-        first: int,
-        starts: wp.array(dtype=wp.int32),
-        terms: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=matrix),
-        sums_out: wp.array(dtype=matrix),
-    ):
-        """Sums the entries that each term, halved, says, or their transposes, where it is odd."""
-        number = first + wp.tid()
-        total = matrix()
-        for k in range(starts[number], starts[number + 1]):
-            term = terms[k]
-            block = entries[term >> 1]
-            if (term & 1) == 1:
-                block = wp.transpose(block)
-            total += block
-        sums_out[number] = total
-
-    return add_up_cells

@@ -21,6 +21,9 @@ from warpfem.linear.slices import SlicedMatrix
 from warpfem.model import CellBlock, Model, Route
 from warpfem.tensor import is_positive_definite
 
+SLICED_POINTS = 1000
+"""Points from which on products are computed many rows at a time, which takes a second to compile once."""
+
 Hessian: TypeAlias = Literal["exact", Filter]
 
 
@@ -263,13 +266,13 @@ class AssembledOperator(TangentOperator):
     def __init__(self, model: Model, external: bool) -> None:
         super().__init__(model, external)
         self.assembly = Assembly(model, self.free)
-        self.divided = model.team.size > 1
         self._sliced = None
-        if model.device.is_cpu:  # a GPU has lanes of its own
+        if model.device.is_cpu and model.point_count >= SLICED_POINTS:  # a GPU has lanes of its own
             pattern = self.assembly.pattern
             self._sliced = SlicedMatrix(
                 pattern.row_starts, pattern.columns, self.assembly.blocks, model.dtype, model.team
             )
+        self.divided = self._sliced is not None and self._sliced.threads > 1
 
     def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
         self.hessian = hessian

@@ -22,16 +22,19 @@ SLICE = 64
 WINDOW = 512
 """Rows among which those of equal length are brought together: their part of a vector fits the first-level cache."""
 
-_FLAGS = "-march=native -ffp-contract=fast -mllvm=-capture-tracking-max-uses-to-explore=10000"
+
+SLICES_PER_THREAD = 48
+"""Slices for which a thread is worth while: handing over work costs as much as some tens."""
 
 
 @functools.cache
 def _kernels(dim: int, dtype: str) -> SimpleNamespace:
     t = types(dim, dtype)
     vector, matrix, scalar = t.vector, t.matrix, t.scalar
-    options = {"cpu_compiler_flags": _FLAGS}
+    module = f"warpfem.slices_{dim}_{dtype}"
+    wp.set_module_options({"cpu_compiler_flags": "-march=native -ffp-contract=fast"}, module=wp.get_module(module))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=options)
+    @wp.kernel(module=module, enable_backward=False)
     def fill(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -59,7 +62,7 @@ def _kernels(dim: int, dtype: str) -> SimpleNamespace:
         if row >= 0:
             out[row] = value
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=options)
+    @wp.kernel(module=module, enable_backward=False)
     def multiply(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -90,7 +93,7 @@ def _kernels(dim: int, dtype: str) -> SimpleNamespace:
                 result[k] = totals[k * SLICE + lane]
             put(product_out, rows[own * SLICE + lane], result)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=options)
+    @wp.kernel(module=module, enable_backward=False)
     def subtract_product(
         first: int,
         starts: wp.array(dtype=wp.int32),
@@ -139,6 +142,7 @@ class SlicedMatrix:
 
     Attributes:
         slice_count: slices.
+        threads: the threads that share them.
     """
 
     def __init__(self, row_starts: np.ndarray, columns: np.ndarray, blocks: wp.array, dtype: str, team: Team) -> None:
@@ -150,6 +154,7 @@ class SlicedMatrix:
         lengths = np.diff(row_starts)
         count = len(lengths)
         self.slice_count = -(-count // SLICE)
+        self.threads = max(1, min(team.size, self.slice_count // SLICES_PER_THREAD))
         order = np.lexsort((-lengths, np.arange(count) // WINDOW))
         rows = np.full(self.slice_count * SLICE, -1)
         rows[:count] = order
@@ -194,7 +199,7 @@ class SlicedMatrix:
         def record() -> list[Job]:
             launches = [
                 wp.launch(kernel, len(part), inputs=[part.start, *inputs], outputs=[out], device="cpu", record_cmd=True)
-                for part in share(self.slice_count, self._team.size)
+                for part in share(self.slice_count, self.threads)
             ]
             return jobs([[launch] for launch in launches])
 
