@@ -23,8 +23,8 @@ WINDOW = 512
 """Rows among which those of equal length are brought together: their part of a vector fits the first-level cache."""
 
 
-SLICES_PER_THREAD = 48
-"""Slices for which a thread is worth while: handing over work costs as much as some tens."""
+SLICES_PER_THREAD = 128
+"""Slices for which a thread is worth while: handing over work costs as much as some tens, twice in each iteration."""
 
 
 @functools.cache
