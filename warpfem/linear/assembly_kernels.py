@@ -15,24 +15,29 @@ def assembly_kernels(dim: int, dtype: str) -> SimpleNamespace:
     vector, matrix, scalar = t.vector, t.matrix, t.scalar
     module = f"warpfem.assembly_{dim}_{dtype}"
 
+    # Arrays are seen through views of length 0, which need no test of negative indices.
+
     @wp.kernel(module=module, enable_backward=False)
     def add_up_cells(
         first: int,
         starts: wp.array(dtype=wp.int32),
+        middles: wp.array(dtype=wp.int32),
         terms: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=matrix),
         sums_out: wp.array(dtype=matrix),
     ):
-        """Sums the entries that each term, halved, says, or their transposes, where it is odd."""
+        """Sums the entries of each sum's terms, from the middle on their transposes."""
         number = first + wp.tid()
+        middle = middles[number]
+        own = wp.array(ptr=entries.ptr, shape=(0,), dtype=matrix)
+        places = wp.array(ptr=terms.ptr, shape=(0,), dtype=wp.int32)
         total = matrix()
-        for k in range(starts[number], starts[number + 1]):
-            term = terms[k]
-            block = entries[term >> 1]
-            if (term & 1) == 1:
-                block = wp.transpose(block)
-            total += block
-        sums_out[number] = total
+        for k in range(starts[number], middle):
+            total += own[places[k]]
+        turned = matrix()
+        for m in range(middle, starts[number + 1]):
+            turned += own[places[m]]
+        sums_out[number] = total + wp.transpose(turned)
 
     @wp.kernel(module=module, enable_backward=False)
     def assemble(
@@ -53,11 +58,14 @@ def assembly_kernels(dim: int, dtype: str) -> SimpleNamespace:
     ):
         """Sums parts, mass and the extra blocks on the diagonal; held rows and columns become those of I."""
         i = first + wp.tid()
+        own = wp.array(ptr=parts.ptr, shape=(0,), dtype=matrix)
+        places = wp.array(ptr=terms.ptr, shape=(0,), dtype=wp.int32)
+        blocks = wp.array(ptr=blocks_out.ptr, shape=(0,), dtype=matrix)
         number = upper_starts[i]
         for slot in range(diagonal[i], row_starts[i + 1]):
             total = matrix()
             for k in range(sum_starts[number], sum_starts[number + 1]):
-                total += parts[terms[k]]
+                total += own[places[k]]
             j = columns[slot]
             if j == i:
                 total = scalar(0.5) * (total + wp.transpose(total))
@@ -68,9 +76,9 @@ def assembly_kernels(dim: int, dtype: str) -> SimpleNamespace:
                 total = wp.cw_mul(wp.outer(free[i], free[j]), total)
                 if j == i:
                     total += wp.diag(vector(scalar(1.0)) - free[i])
-            blocks_out[slot] = total
+            blocks[slot] = total
             if j > i:
-                blocks_out[mirror[number]] = wp.transpose(total)
+                blocks[mirror[number]] = wp.transpose(total)
             number += 1
 
     return SimpleNamespace(add_up_cells=add_up_cells, assemble=assemble)

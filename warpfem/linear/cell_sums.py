@@ -50,22 +50,24 @@ class CellSums:
             a, b, entry = a[a == b], b[a == b], entry[:, a == b]
         i, j = points[:, a], points[:, b]
         bound = int(points.max()) + 1
-        key = (((cell // size)[:, None] * bound + np.minimum(i, j)) * bound + np.maximum(i, j)).ravel()
-        term = (2 * entry + (i > j)).ravel()
-        order = np.argsort(key, kind="stable")
-        key = key[order]
+        key = (((cell // size)[:, None] * bound + np.minimum(i, j)) * bound + np.maximum(i, j)) * 2 + (i > j)
+        order = np.argsort(key.ravel(), kind="stable")
+        key, turned = np.divmod(key.ravel()[order], 2)
         starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1], [True]]))
+        middles = starts[1:] - np.add.reduceat(turned, starts[:-1])
         group, pair = np.divmod(key[starts[:-1]], bound * bound)
         self.first, self.second = np.divmod(pair, bound)
         self._sum_starts = np.searchsorted(group, np.arange(len(self._groups) + 1)).tolist()
-        self._starts, self._terms = (wp.array(data, dtype=wp.int32, device=device) for data in (starts, term[order]))
+        self._lists = [
+            wp.array(data, dtype=wp.int32, device=device) for data in (starts, middles, entry.ravel()[order])
+        ]
         matrix = block.kernels.types.matrix
         self._entries = [wp.empty(entry_count(size, corners), dtype=matrix, device=device) for _ in range(threads)]
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
         vectorized = [] if self._vectorized is None else self._vectorized.arrays()
-        return [self._starts, self._terms, *self._entries, *vectorized]
+        return [*self._lists, *self._entries, *vectorized]
 
     def compute(self, kernel: str, u: wp.array, sums_out: wp.array) -> None:
         """Computes the sums.
@@ -97,7 +99,7 @@ class CellSums:
                     wp.launch(
                         add_up,
                         last - first,
-                        inputs=[first, self._starts, self._terms, entries],
+                        inputs=[first, *self._lists, entries],
                         outputs=[sums_out],
                         device=block.device,
                         record_cmd=True,

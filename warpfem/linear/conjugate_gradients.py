@@ -201,7 +201,7 @@ class ConjugateGradients:
         if self._scalar(_RESIDUAL) ** 0.5 <= target:
             return 0, LinearStatus.CONVERGED
         for iteration in range(max_iterations):
-            if iteration == 0:
+            if self._graph is None and iteration == 0:  # which loads the kernels
                 self._launch_iteration(operator, preconditioner, x)
             else:
                 self._replay(operator, preconditioner, x)
