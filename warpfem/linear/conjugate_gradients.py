@@ -14,13 +14,10 @@ from warpfem.dtypes import types
 from warpfem.launches import Launcher
 from warpfem.linear.operators import TangentOperator
 from warpfem.model import Model
-from warpfem.points import CHUNK, chunks
+from warpfem.points import CHUNK, LANES, chunks, entry_functions
 
 PROGRESS = 0.5
 """A new start from the true residual that leaves more than this part of it shows that rounding hides the rest."""
-
-LANES = 64
-"""Entries of vectors that are taken side by side."""
 
 # Entries of the float64 array of scalars that conjugate gradients keep on the device.
 _RHO = wp.constant(0)  # r . z
@@ -275,28 +272,8 @@ def _kernels(dim: int, dtype: str, on_cpu: bool) -> SimpleNamespace:
     module = f"warpfem.conjugate_gradients_{dim}_{dtype}"
     span = CHUNK if on_cpu else 1
 
-    # A point's components are entries of their own here, and those of a loop over lanes independent of one another, of
-    # which the compiler makes vector code.
-
-    @wp.func
-    def flat(a: wp.array(dtype=vector)):
-        return wp.array(ptr=a.ptr, shape=(0,), dtype=scalar)
-
-    @wp.func
-    def inner(a: wp.array(dtype=scalar), b: wp.array(dtype=scalar), start: int, count: int):
-        """a . b over a range of entries."""
-        lanes = wp.zeros(shape=(LANES,), dtype=wp.float64)
-        rounds = count // LANES
-        for k in range(rounds):
-            for lane in range(LANES):
-                i = start + k * LANES + lane
-                lanes[lane] = lanes[lane] + wp.float64(a[i]) * wp.float64(b[i])
-        result = wp.float64(0.0)
-        for rest in range(start + rounds * LANES, start + count):
-            result += wp.float64(a[rest]) * wp.float64(b[rest])
-        for place in range(LANES):
-            result += lanes[place]
-        return result
+    functions = entry_functions(dim, dtype)
+    flat, inner = functions.flat, functions.inner
 
     @wp.func
     def add_multiple(factor: scalar, a: wp.array(dtype=scalar), out: wp.array(dtype=scalar), start: int, count: int):
