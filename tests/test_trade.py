@@ -422,6 +422,20 @@ def test_all_frames_are_not_run_again_as_the_first_ones(bar, tmp_path, monkeypat
     assert len(runs.labels) == 2
 
 
+def test_places_stand_for_the_same_volume_but_for_few_of_small_bodies(tmp_path):
+    path = tmp_path / "three.py"
+    path.write_text(
+        "import warpfem as wf\n"
+        "def scene():\n"
+        "    sizes = {'large': 3.0, 'middle': 1.0, 'small': 0.04}\n"
+        "    meshes = {name: wf.Mesh.rectangle((size, 1), (2, 2)) for name, size in sizes.items()}\n"
+        "    bodies = [wf.Body(name, mesh, wf.LinearElasticity(E=1e5, nu=0.3)) for name, mesh in meshes.items()]\n"
+        "    return wf.Scene(bodies, wf.BackwardEuler())\n"
+    )
+    counts = [len(own) for own in Study(Problem.of(path), Store(tmp_path / "runs"), Here()).places]
+    assert counts == [297, 99, 10]
+
+
 def test_motions_are_compared_at_the_same_places_though_meshes_come_out_different(bar, tmp_path):
     shuffled = "    mesh = replace(mesh, cells=np.random.default_rng().permutation(mesh.cells))\n    bar ="
     bar.write_text("from dataclasses import replace\nimport numpy as np\n" + BAR.replace("    bar =", shuffled))

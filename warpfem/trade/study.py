@@ -20,7 +20,10 @@ from warpfem.trade.process import run_order
 from warpfem.trade.store import Store
 
 PLACES = 400
-"""Places at which motions are compared, over all bodies."""
+"""Places at which motions are compared, over all bodies, each standing for the same volume."""
+
+FEWEST_PLACES = 10
+"""Places of a body that is a small part of the volume."""
 
 ROUNDS = 5
 """Runs in one process of a setting whose runs are short."""
@@ -121,8 +124,9 @@ class Study:
         self.places = store.places(self.problem, self._spread)
 
     def _spread(self) -> list[np.ndarray]:
-        share = max(1, PLACES // len(self.scene.bodies))
-        return [spread_places(body.mesh, share) for body in self.scene.bodies]
+        volumes = np.array([body.mesh.cell_volumes.sum() for body in self.scene.bodies])
+        counts = np.maximum(FEWEST_PLACES, np.rint(PLACES * volumes / volumes.sum()).astype(int))
+        return [spread_places(body.mesh, count) for body, count in zip(self.scene.bodies, counts, strict=True)]
 
     def shortened(self, frames: int) -> Study:
         """The same study of the first frames alone."""
