@@ -18,7 +18,7 @@ from warpfem.model import Model, State
 from warpfem.moduli import Parameter
 from warpfem.scene import Body, Scene
 from warpfem.solvers import SymplecticEuler
-from warpfem.stiffness import all_blocks, pair_count
+from warpfem.stiffness import all_blocks, entry_count
 
 IDENTITY = np.eye(3)
 LEVI_CIVITA = np.zeros((3, 3, 3))
@@ -288,9 +288,9 @@ class Samples:
     def _tangent(self, kernel: str) -> np.ndarray:
         (block,) = self.model.blocks
         n, d = len(self.F), self.dim
-        stored = wp.zeros(n * pair_count(d + 1), dtype=self.model.types.matrix, device=self.model.device)
+        stored = wp.zeros(entry_count(n, d + 1), dtype=self.model.types.matrix, device=self.model.device)
         block.launch(kernel, [self.state.u], [stored])
-        K = all_blocks(stored.numpy(), d + 1)
+        K = all_blocks(stored.numpy(), n, d + 1)
         return K[:, 1:, 1:].transpose(0, 3, 1, 4, 2) / self.volume  # K[j, l, i, k] couples F_ij and F_kl
 
 

@@ -29,7 +29,7 @@ LAYERS = [
     {"scene", "embedding"},
     {"supports", "contact"},
     {"model"},
-    {"averaged", "vectorized"},
+    {"averaged", "vectorized", "vectorized_stiffness"},
     {"linear", "reactions"},
     {"solvers"},
     {"simulation"},

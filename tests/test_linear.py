@@ -9,7 +9,15 @@ from helpers import custom_neo_hookean, irregular_mesh, model_of
 
 from warpfem.boundary import Pin, Plane, PrescribedMotion
 from warpfem.errors import SimulationError
-from warpfem.linear import BlockJacobi, ConjugateGradients, LinearStatus, TangentOperator, tangent_operator
+from warpfem.linear import (
+    BlockJacobi,
+    ConjugateGradients,
+    LinearStatus,
+    TangentOperator,
+    operators,
+    slices,
+    tangent_operator,
+)
 from warpfem.linear.operators import operator_kernels
 from warpfem.materials import (
     FixedCorotated,
@@ -248,6 +256,30 @@ def test_block_jacobi_inverts_the_diagonal(dim, route):
     A[held, held] = 1.0
     expected = np.stack([np.linalg.inv(A[i : i + dim, i : i + dim]) for i in range(0, len(A), dim)])
     np.testing.assert_allclose(operator.inverse_diagonal.numpy(), expected, rtol=1e-10, atol=1e-12 * expected.max())
+
+
+@settings
+def test_products_of_many_rows_at_a_time_are_those_of_one(dim, dtype, monkeypatch):
+    """With rows of different lengths, held points and slices that are not full."""
+    model = bodies_of(dim, dtype, SOME)
+    rows = tangent_operator(model, "assembled")
+    monkeypatch.setattr(operators, "SLICED_POINTS", 1)
+    monkeypatch.setattr(slices, "WINDOW", 32)
+    sliced = tangent_operator(model, "assembled")
+    p, b = (
+        wp.array(np.random.default_rng(k).normal(size=(model.point_count, dim)), dtype=model.types.vector)
+        for k in (1, 2)
+    )
+    results = []
+    for operator in (rows, sliced):
+        operator.linearize(shaken(model).u, 3.0)
+        product, difference = model.zeros(), model.zeros()
+        operator.apply(p, product)
+        operator.subtract_product(b, p, difference)
+        results.append((product.numpy().copy(), difference.numpy().copy()))
+    for expected, found in zip(*results, strict=True):
+        assert np.abs(found - expected).max() <= 4.0 * model.types.epsilon * np.abs(expected).max()
+    assert len(sliced.arrays()) > len(rows.arrays())
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import warpfem as wf
+from warpfem.linear import tangent_operator
 from warpfem.solvers import explicit, implicit
 from warpfem.strips import STRIP, cut_into_strips
 from warpfem.subnormals import SubnormalsFlushed
@@ -109,6 +110,39 @@ def test_cells_that_the_direct_stress_leaves_out_have_that_of_the_plain_kernel()
     assert 0.5 < known[4] < 1.0
 
 
+@pytest.mark.parametrize(
+    ("kind", "case"),
+    [
+        (wf.FixedCorotated, "3D, single precision, one modulus"),
+        (wf.NeoHookean, "2D, double precision, moduli per cell"),
+        *(
+            pytest.param(kind, case, marks=pytest.mark.slow)
+            for kind in (wf.LinearElasticity, wf.StVenantKirchhoff, wf.StableNeoHookean, wf.FixedCorotated)
+            for case in ("3D, double precision, moduli per cell", "2D, single precision, one modulus")
+        ),
+    ],
+)
+def test_the_stiffness_is_that_of_the_plain_kernel(kind, case):
+    """Also of cells turned inside out, whose rotation is not known without branches."""
+    mesh = MESHES["box" if "3D" in case else "rectangle"]
+    dtype, limit = ("float32", 2e-6) if "single" in case else ("float64", 1e-14)
+    E = 1e5 if "one" in case else np.linspace(1e5, 1e6, mesh.cell_count)
+    model = wf.Model(_scene(mesh, kind(E=E, nu=0.3)), device="cpu", dtype=dtype, threads=1)
+    noise = np.random.default_rng(0).normal(size=mesh.points.shape)
+    sizes = [0.03 * mesh.mean_edge_length, *([1.0] if kind is wf.FixedCorotated else [])]
+    plain = tangent_operator(model, "assembled", external=False)
+    model.vectorize(explicit.VECTORIZED_CELLS)
+    vectorized = tangent_operator(model, "assembled", external=False)
+    for size in sizes:
+        state = model.state()
+        state.assign(displacement=size * noise)
+        for operator in (plain, vectorized):
+            operator.linearize(state.u, 0.0)
+        expected = plain.assembly.blocks.numpy()
+        difference = np.abs(vectorized.assembly.blocks.numpy() - expected).max()
+        assert 0.0 < difference <= limit * np.abs(expected).max()
+
+
 def test_small_bodies_and_materials_with_branches_keep_the_plain_kernel():
     class Branching(wf.StableNeoHookean):
         functions = dataclasses.replace(wf.StableNeoHookean.functions, branchless=False)
@@ -132,7 +166,12 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     for module in ("model", "solvers.explicit"):
         monkeypatch.setattr(f"warpfem.{module}.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
+    if not isinstance(solver, wf.BackwardEuler):
+        monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)  # as if there were many bodies
     monkeypatch.setattr(explicit, "WINDOW", 64)
+    monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
+    monkeypatch.setattr("warpfem.linear.operators.SLICED_POINTS", 64)
+    monkeypatch.setattr("warpfem.linear.slices.SLICES_PER_THREAD", 1)
     mesh = MESHES["box"]
     mesh = mesh.with_point_set("bottom", np.flatnonzero(mesh.points[:, 1] == 0.0))
     results = []

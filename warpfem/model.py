@@ -22,7 +22,7 @@ from warpfem.mesh import Mesh
 from warpfem.points import chunks, point_kernels
 from warpfem.scene import Body, Scene
 from warpfem.shapes import Shape
-from warpfem.stiffness import all_blocks, pair_count
+from warpfem.stiffness import all_blocks, entry_count
 from warpfem.strips import STRIP
 from warpfem.threads import CELLS_PER_THREAD, Team, available_threads
 
@@ -613,9 +613,9 @@ class Model:
         for start in range(0, block.count, most):
             part = slice(start, min(start + most, block.count))
             count = part.stop - start
-            values = wp.empty(count * pair_count(corners), dtype=self.types.matrix, device=self.device)
+            values = wp.empty(entry_count(count, corners), dtype=self.types.matrix, device=self.device)
             block.launch("stiffness", [u], [values], part=part, kernels=block.bounding_kernels)
-            yield part, all_blocks(values.numpy(), corners).transpose(0, 1, 3, 2, 4)
+            yield part, all_blocks(values.numpy(), count, corners).transpose(0, 1, 3, 2, 4)
 
     def stresses(self, state: State) -> Stresses:
         """Deformation gradients and stresses at every quadrature point: one per linear cell, dim + 1 per quadratic."""

@@ -1,7 +1,8 @@
 """Kernels of the cells' tangent stiffness K = d²U/du², as d x d blocks between the points of a cell.
 
-K is symmetric, so that only the blocks K_ab with a <= b are written, of each cell one after another and row by row:
-:func:`pair_index` says where. Each task computes one cell and writes what no other does.
+K is symmetric, so that only the blocks K_ab with a <= b are written. Cells come in chunks of ``CHUNK``, and in a chunk
+the blocks of a pair (a, b) lie together, those of the next pair after them, row by row: :func:`entry_numbers` says
+where. Each task computes one cell and writes what no other does.
 """
 
 from typing import Any
@@ -14,27 +15,42 @@ from warpfem.materials.base import Constitutive
 from warpfem.shapes import Shape
 from warpfem.tensor import deformation_gradient, polar_rotation
 
+CHUNK = 64
+"""Cells whose blocks lie together."""
+
 
 def pair_count(point_count: int) -> int:
     """Blocks that are stored of a cell with that many points."""
     return point_count * (point_count + 1) // 2
 
 
-def pair_index(point_count: int) -> np.ndarray:
-    """The place of the block K_ab, or of its transpose, among those of a cell, (k, k) int."""
-    index = np.zeros((point_count, point_count), dtype=np.int64)
-    rows, columns = np.triu_indices(point_count)
-    index[rows, columns] = index[columns, rows] = np.arange(len(rows))
-    return index
+def entry_count(cell_count: int, point_count: int) -> int:
+    """Blocks for which there must be room: chunks are whole."""
+    return -(-cell_count // CHUNK) * CHUNK * pair_count(point_count)
 
 
-def all_blocks(stored: np.ndarray, point_count: int) -> np.ndarray:
+def entry_numbers(cell_count: int, point_count: int) -> np.ndarray:
+    """The place of each cell's blocks K_ab, a <= b, row by row, (cell_count, pairs) int."""
+    chunk, lane = np.divmod(np.arange(cell_count), CHUNK)
+    pairs = pair_count(point_count)
+    return (chunk[:, None] * pairs + np.arange(pairs)) * CHUNK + lane[:, None]
+
+
+def all_blocks(stored: np.ndarray, cell_count: int, point_count: int) -> np.ndarray:
     """The blocks K_ab of cells of that many points, (count, k, k, d, d) float64, from those that are stored."""
     dim = stored.shape[-1]
-    blocks = stored.astype(np.float64).reshape(-1, pair_count(point_count), dim, dim)[:, pair_index(point_count)]
-    rows, columns = np.tril_indices(point_count, -1)
-    blocks[:, rows, columns] = blocks[:, rows, columns].swapaxes(-2, -1)
+    rows, columns = np.triu_indices(point_count)
+    blocks = np.empty((cell_count, point_count, point_count, dim, dim))
+    upper = stored[entry_numbers(cell_count, point_count)].astype(np.float64)
+    blocks[:, columns, rows] = upper.swapaxes(-2, -1)
+    blocks[:, rows, columns] = upper
     return blocks
+
+
+@wp.func
+def _first_entry(cell: int, pairs: int):
+    """The place of a cell's block K_00."""
+    return (cell // CHUNK * pairs) * CHUNK + cell % CHUNK
 
 
 @wp.func
@@ -90,7 +106,7 @@ def exact_stiffness_kernel(
         entries_out: wp.array(dtype=matrix),
     ):
         c = wp.tid()
-        first = c * pairs
+        first = _first_entry(c, pairs)
         count = int(others)
         rounds = int(places)
         for place in range(rounds):
@@ -114,14 +130,14 @@ def exact_stiffness_kernel(
                     for m in range(dim):
                         rows[k * dim + m] = dP[m]
                 column = matrix()
-                slot = first + points + b
+                slot = first + (points + b) * CHUNK
                 for a in range(count):
                     block = block_of(rows, gradients[a])
                     column += block
                     if a <= b:
                         _put(entries_out, slot, block, place)
-                        slot += others - 1 - a
-                _put(entries_out, first + b + 1, -column, place)  # the gradients of all add up to zero
+                        slot += (others - 1 - a) * CHUNK
+                _put(entries_out, first + (b + 1) * CHUNK, -column, place)  # the gradients of all add up to zero
                 corner += column
             _put(entries_out, first, corner, place)
 
@@ -169,7 +185,7 @@ def filtered_stiffness_kernel(
                 g = rest_gradients[k] * t.V
                 gradients[k + 1] = g
                 gradients[0] = gradients[0] - g
-            slot = c * pairs
+            slot = _first_entry(c, pairs)
             for a in range(count):
                 g = gradients[a]
                 for b in range(a, count):
@@ -178,6 +194,6 @@ def filtered_stiffness_kernel(
                     K = wp.cw_mul(t.stretch, wp.outer(g, h)) + wp.cw_mul(t.swapped, wp.outer(h, g))
                     K += wp.diag(t.same * wp.cw_mul(g, h))
                     _put(entries_out, slot, volume[i] * (t.U * K * wp.transpose(t.U)), place)
-                    slot += 1
+                    slot += CHUNK
 
     return filtered_element_stiffness

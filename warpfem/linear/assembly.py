@@ -1,19 +1,19 @@
 """Assembly of the cells' stiffness into block-compressed rows whose pattern is found once, without sorting or atomics.
 
-Each task sums the blocks of one row, from the diagonal on, by a list of the cells' entries, and writes each and its
-transpose: the order of every sum is fixed, so that the bits do not depend on how many tasks run at a time.
+The cells are summed in groups first (see ``cell_sums.py``). Then each task sums what the groups have of one row, from
+the diagonal on, by a list, and writes each block and its transpose: the order of every sum is fixed, so that bits do
+not depend on how many tasks run at a time.
 """
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from warpfem.dtypes import types
 from warpfem.launches import Recordings, jobs
+from warpfem.linear.assembly_kernels import assembly_kernels
+from warpfem.linear.cell_sums import CellSums
 from warpfem.model import Model
-from warpfem.stiffness import pair_count
 from warpfem.threads import Job, share
 
 
@@ -27,7 +27,7 @@ class Pattern:
         upper_starts: number of the first sum of each row: its blocks from the diagonal on are numbered through.
         mirror: place of each sum's transpose.
         sum_starts: first term of each sum.
-        terms: twice the number of a cell's entry, plus 1 if its transpose is meant.
+        terms: the numbers of the groups' sums.
     """
 
     row_starts: np.ndarray
@@ -39,21 +39,10 @@ class Pattern:
     terms: np.ndarray
 
 
-def find_pattern(model: Model, diagonal_only: bool = False) -> Pattern:
-    """The pattern of all pairs of points that share a cell, or of the diagonal alone."""
-    n = model.point_count
-    keys, terms, offset = [], [], 0
-    for block in model.blocks:
-        corners = block.shape.point_count
-        a, b = np.triu_indices(corners)
-        entry = offset + np.arange(block.count)[:, None] * len(a) + np.arange(len(a))
-        offset += entry.size
-        if diagonal_only:
-            a, b, entry = a[a == b], b[a == b], entry[:, a == b]
-        i, j = block.host_cells[:, a].astype(np.int64), block.host_cells[:, b].astype(np.int64)
-        keys.append((np.minimum(i, j) * n + np.maximum(i, j)).ravel())
-        terms.append((2 * entry + (i > j)).ravel())
-    key, term = np.concatenate(keys), np.concatenate(terms)
+def find_pattern(point_count: int, first: np.ndarray, second: np.ndarray) -> Pattern:
+    """The pattern of a symmetric matrix with blocks for these points i <= j, which may come several times."""
+    n = point_count
+    key = first * n + second
     order = np.argsort(key, kind="stable")
     key = key[order]
     sum_starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1], [True]]))
@@ -74,7 +63,7 @@ def find_pattern(model: Model, diagonal_only: bool = False) -> Pattern:
         upper_starts=np.searchsorted(i, np.arange(n)),
         mirror=mirror,
         sum_starts=sum_starts,
-        terms=term[order],
+        terms=order,
     )
 
 
@@ -95,14 +84,15 @@ class Assembly:
             diagonal_only: whether the diagonal blocks alone are needed.
         """
         self.model = model
-        self.pattern = pattern = find_pattern(model, diagonal_only)
+        self._sums = [CellSums(block, model.team, diagonal_only) for block in model.blocks]
+        first, second = (np.concatenate([getattr(own, name) for own in self._sums]) for name in ("first", "second"))
+        self.pattern = pattern = find_pattern(model.point_count, first, second)
         indices = {name: wp.array(data, dtype=wp.int32, device=model.device) for name, data in vars(pattern).items()}
-        self.row_starts, self.columns, self.diagonal, *self._sums = indices.values()
+        self.row_starts, self.columns, self.diagonal, *self._lists = indices.values()
         self.blocks = self._new_blocks(len(pattern.columns))
-        counts = [block.count * pair_count(block.shape.point_count) for block in model.blocks]
-        self._entries = self._new_blocks(sum(counts))
-        ends = np.cumsum(counts).tolist()
-        self._parts = [self._entries[end - count : end] for end, count in zip(ends, counts, strict=True)]
+        self._parts = self._new_blocks(len(first))
+        ends = np.cumsum([len(own.first) for own in self._sums]).tolist()
+        self._parts_of = [self._parts[end - len(own.first) : end] for own, end in zip(self._sums, ends, strict=True)]
         self._free = free
         self._recordings = Recordings()
 
@@ -118,87 +108,31 @@ class Assembly:
             mass_weight: what the mass is multiplied by [1/s^2].
             extra: blocks to add on the diagonal, one per point; empty: none.
         """
-        key = (kernel, u.ptr, mass_weight, extra.ptr)
-        for part in self._recordings.get(key, lambda: self._record(kernel, u, mass_weight, extra)):
-            self.model.team.run(part)
+        for sums, part in zip(self._sums, self._parts_of, strict=True):
+            sums.compute(kernel, u, part)
+        key = (mass_weight, extra.ptr)
+        self.model.team.run(self._recordings.get(key, lambda: self._record(mass_weight, extra)))
 
-    def _record(self, kernel: str, u: wp.array, mass_weight: float, extra: wp.array) -> tuple[list[Job], list[Job]]:
-        """The launches of the cells' entries, then those that sum them up, divided among threads."""
-        model, size = self.model, self.model.team.size
-        cells: list[list[wp.Launch | None]] = [[] for _ in range(size)]
-        for block, entries in zip(model.blocks, self._parts, strict=True):
-            pairs = pair_count(block.shape.point_count)
-            for launches, part in zip(cells, share(block.count, size), strict=True):
-                out = entries[part.start * pairs : part.stop * pairs]
-                launches.append(block.launch(kernel, [u], [out], part=slice(part.start, part.stop), record=True))
+    def _record(self, mass_weight: float, extra: wp.array) -> list[Job]:
+        model = self.model
         inputs = [
-            *(self.row_starts, self.columns, self.diagonal, *self._sums),
-            *(self._entries, model.mass, mass_weight, extra, self._free),
+            *(self.row_starts, self.columns, self.diagonal, *self._lists),
+            *(self._parts, model.mass, mass_weight, extra, self._free),
         ]
         rows = [
             wp.launch(
-                _assemble_kernel(model.dim, model.dtype),
+                assembly_kernels(model.dim, model.dtype).assemble,
                 len(part),
                 inputs=[part.start, *inputs],
                 outputs=[self.blocks],
                 device=model.device,
                 record_cmd=True,
             )
-            for part in share(model.point_count, size)
+            for part in share(model.point_count, model.team.size)
         ]
-        return jobs(cells), jobs([[row] for row in rows])
+        return jobs([[row] for row in rows])
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [self.row_starts, self.columns, self.diagonal, *self._sums, self.blocks, self._entries]
-
-
-@functools.cache
-def _assemble_kernel(dim: int, dtype: str) -> wp.Kernel:
-    t = types(dim, dtype)
-    vector, matrix, scalar = t.vector, t.matrix, t.scalar
-
-    @wp.kernel(module=f"warpfem.assembly_{dim}_{dtype}", enable_backward=False)
-    def assemble(
-        first: int,
-        row_starts: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        diagonal: wp.array(dtype=wp.int32),
-        upper_starts: wp.array(dtype=wp.int32),
-        mirror: wp.array(dtype=wp.int32),
-        sum_starts: wp.array(dtype=wp.int32),
-        terms: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=matrix),
-        mass: wp.array(dtype=scalar),
-        mass_weight: scalar,
-        extra: wp.array(dtype=matrix),
-        free: wp.array(dtype=vector),
-        blocks_out: wp.array(dtype=matrix),
-    ):
-        """Sums entries, mass and the extra blocks on the diagonal; held rows and columns become those of I."""
-        i = first + wp.tid()
-        number = upper_starts[i]
-        for slot in range(diagonal[i], row_starts[i + 1]):
-            total = matrix()
-            for k in range(sum_starts[number], sum_starts[number + 1]):
-                term = terms[k]
-                block = entries[term >> 1]
-                if (term & 1) == 1:
-                    block = wp.transpose(block)
-                total += block
-            j = columns[slot]
-            if j == i:
-                total = scalar(0.5) * (total + wp.transpose(total))
-                total += (mass_weight * mass[i]) * wp.identity(n=dim, dtype=scalar)
-                if extra.shape[0] > 0:
-                    total += extra[i]
-            if free.shape[0] > 0:
-                total = wp.cw_mul(wp.outer(free[i], free[j]), total)
-                if j == i:
-                    total += wp.diag(vector(scalar(1.0)) - free[i])
-            blocks_out[slot] = total
-            if j > i:
-                blocks_out[mirror[number]] = wp.transpose(total)
-            number += 1
-
-    return assemble
+        own = [self.row_starts, self.columns, self.diagonal, *self._lists, self.blocks, self._parts]
+        return [*own, *(array for sums in self._sums for array in sums.arrays())]

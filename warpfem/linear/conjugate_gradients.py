@@ -14,7 +14,7 @@ from warpfem.dtypes import types
 from warpfem.launches import Launcher
 from warpfem.linear.operators import TangentOperator
 from warpfem.model import Model
-from warpfem.points import CHUNK, chunks
+from warpfem.points import CHUNK, LANES, chunks, entry_functions
 
 PROGRESS = 0.5
 """A new start from the true residual that leaves more than this part of it shows that rounding hides the rest."""
@@ -84,7 +84,7 @@ class BlockJacobi(Preconditioner):
 
     def __init__(self, operator: TangentOperator) -> None:
         self._operator = operator
-        self._kernel = _kernels(operator.model.dim, operator.model.dtype).multiply_blocks
+        self._kernel = _kernels(operator.model.dim, operator.model.dtype, operator.model.device.is_cpu).multiply_blocks
         self._launch = Launcher(operator.model.device)
 
     def apply(self, r: wp.array, z_out: wp.array) -> None:
@@ -104,7 +104,8 @@ class ConjugateGradients:
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        self._kernels = _kernels(model.dim, model.dtype)
+        self._kernels = _kernels(model.dim, model.dtype, model.device.is_cpu)
+        self._tasks = chunks(model.point_count) if model.device.is_cpu else model.point_count
         self._r, self._z, self._p, self._q = (model.zeros() for _ in range(4))
         self._parts = wp.zeros((2, chunks(model.point_count)), dtype=wp.float64, device=model.device)
         self._scalars = wp.zeros(5, dtype=wp.float64, device=model.device)
@@ -197,7 +198,7 @@ class ConjugateGradients:
         if self._scalar(_RESIDUAL) ** 0.5 <= target:
             return 0, LinearStatus.CONVERGED
         for iteration in range(max_iterations):
-            if iteration == 0:
+            if self._graph is None and iteration == 0:  # which loads the kernels
                 self._launch_iteration(operator, preconditioner, x)
             else:
                 self._replay(operator, preconditioner, x)
@@ -245,7 +246,7 @@ class ConjugateGradients:
         return float(values[index])
 
     def _launch(self, name: str, inputs: list, outputs: list) -> None:
-        self._launch_tasks(name, self.model.point_count, inputs, outputs)
+        self._launch_tasks(name, self._tasks, inputs, outputs)
 
     def _launch_chunks(self, name: str, inputs: list, outputs: list) -> None:
         self._launch_tasks(name, chunks(self.model.point_count), inputs, outputs)
@@ -258,18 +259,45 @@ class ConjugateGradients:
 
 
 @functools.cache
-def _kernels(dim: int, dtype: str) -> SimpleNamespace:
-    """Vector kernels of conjugate gradients. Sums are of parts, each of one chunk, so that their order is fixed."""
+def _kernels(dim: int, dtype: str, on_cpu: bool) -> SimpleNamespace:
+    """Vector kernels of conjugate gradients. Sums are of parts, each of one chunk, so that their order is fixed.
+
+    Args:
+        dim: components of a point's vector.
+        dtype: "float32" or "float64".
+        on_cpu: whether for the CPU, where a task of few points would cost more than their work.
+    """
     t = types(dim, dtype)
     vector, matrix, scalar = t.vector, t.matrix, t.scalar
     module = f"warpfem.conjugate_gradients_{dim}_{dtype}"
+    span = CHUNK if on_cpu else 1
+
+    functions = entry_functions(dim, dtype)
+    flat, inner = functions.flat, functions.inner
 
     @wp.func
-    def inner(a: vector, b: vector):
-        total = wp.float64(0.0)
-        for k in range(dim):
-            total += wp.float64(a[k]) * wp.float64(b[k])
-        return total
+    def add_multiple(factor: scalar, a: wp.array(dtype=scalar), out: wp.array(dtype=scalar), start: int, count: int):
+        """Adds factor a to a range of entries."""
+        rounds = count // LANES
+        for k in range(rounds):
+            for lane in range(LANES):
+                i = start + k * LANES + lane
+                out[i] = out[i] + factor * a[i]
+        for rest in range(start + rounds * LANES, start + count):
+            out[rest] = out[rest] + factor * a[rest]
+
+    @wp.func
+    def replace_multiple(
+        factor: scalar, a: wp.array(dtype=scalar), out: wp.array(dtype=scalar), start: int, count: int
+    ):
+        """Writes a plus factor times what was there to a range of entries."""
+        rounds = count // LANES
+        for k in range(rounds):
+            for lane in range(LANES):
+                i = start + k * LANES + lane
+                out[i] = a[i] + factor * out[i]
+        for rest in range(start + rounds * LANES, start + count):
+            out[rest] = a[rest] + factor * out[rest]
 
     @wp.func
     def total(parts: wp.array2d(dtype=wp.float64), row: int):
@@ -288,10 +316,9 @@ def _kernels(dim: int, dtype: str) -> SimpleNamespace:
     def curvature(p: wp.array(dtype=vector), q: wp.array(dtype=vector), parts_out: wp.array2d(dtype=wp.float64)):
         """Parts of p . A p."""
         chunk = wp.tid()
-        result = wp.float64(0.0)
-        for i in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, p.shape[0])):
-            result += inner(p[i], q[i])
-        parts_out[0, chunk] = result
+        first = chunk * CHUNK
+        count = wp.min(CHUNK, p.shape[0] - first)
+        parts_out[0, chunk] = inner(flat(p), flat(q), first * dim, count * dim)
 
     @wp.kernel(module=module, enable_backward=False)
     def choose_step(parts: wp.array2d(dtype=wp.float64), scalars_out: wp.array(dtype=wp.float64)):
@@ -312,22 +339,20 @@ def _kernels(dim: int, dtype: str) -> SimpleNamespace:
         r_out: wp.array(dtype=vector),
     ):
         """x += alpha p, r -= alpha A p."""
-        i = wp.tid()
+        first = wp.tid() * span
+        count = wp.min(span, p.shape[0] - first)
         alpha = scalar(scalars[_ALPHA])
-        x_out[i] += alpha * p[i]
-        r_out[i] -= alpha * q[i]
+        add_multiple(alpha, flat(p), flat(x_out), first * dim, count * dim)
+        add_multiple(-alpha, flat(q), flat(r_out), first * dim, count * dim)
 
     @wp.kernel(module=module, enable_backward=False)
     def measure(r: wp.array(dtype=vector), z: wp.array(dtype=vector), parts_out: wp.array2d(dtype=wp.float64)):
         """Parts of r . z and r . r."""
         chunk = wp.tid()
-        rho = wp.float64(0.0)
-        residual = wp.float64(0.0)
-        for i in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, r.shape[0])):
-            rho += inner(r[i], z[i])
-            residual += inner(r[i], r[i])
-        parts_out[0, chunk] = rho
-        parts_out[1, chunk] = residual
+        first = chunk * CHUNK
+        count = wp.min(CHUNK, r.shape[0] - first)
+        parts_out[0, chunk] = inner(flat(r), flat(z), first * dim, count * dim)
+        parts_out[1, chunk] = inner(flat(r), flat(r), first * dim, count * dim)
 
     @wp.kernel(module=module, enable_backward=False)
     def start(parts: wp.array2d(dtype=wp.float64), scalars_out: wp.array(dtype=wp.float64)):
@@ -346,8 +371,9 @@ def _kernels(dim: int, dtype: str) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def turn(z: wp.array(dtype=vector), scalars: wp.array(dtype=wp.float64), p_out: wp.array(dtype=vector)):
         """p = z + beta p, unless p has negative curvature."""
-        i = wp.tid()
+        first = wp.tid() * span
+        count = wp.min(span, z.shape[0] - first)
         if scalars[_CURVATURE] > wp.float64(0.0):
-            p_out[i] = z[i] + scalar(scalars[_BETA]) * p_out[i]
+            replace_multiple(scalar(scalars[_BETA]), flat(z), flat(p_out), first * dim, count * dim)
 
     return SimpleNamespace(**{name: kernel for name, kernel in locals().items() if isinstance(kernel, wp.Kernel)})

@@ -15,11 +15,14 @@ import warp as wp
 from warpfem.dtypes import types
 from warpfem.elements import Filter
 from warpfem.errors import SimulationError
-from warpfem.launches import Launcher, Recordings, jobs
+from warpfem.launches import Launcher
 from warpfem.linear.assembly import Assembly
+from warpfem.linear.slices import SlicedMatrix
 from warpfem.model import CellBlock, Model, Route
 from warpfem.tensor import is_positive_definite
-from warpfem.threads import Job, share
+
+SLICED_POINTS = 1000
+"""Points from which on products are computed many rows at a time, which takes a second to compile once."""
 
 Hessian: TypeAlias = Literal["exact", Filter]
 
@@ -76,20 +79,18 @@ def operator_kernels(dim: int, dtype: str) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def multiply(
-        first: int,
         row_starts: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         blocks: wp.array(dtype=matrix),
         p: wp.array(dtype=vector),
         product_out: wp.array(dtype=vector),
     ):
-        """Writes the product of rows of a block-sparse matrix with p, from the first on."""
-        i = first + wp.tid()
+        """Writes the product of a block-sparse matrix with p."""
+        i = wp.tid()
         product_out[i] = add_row_product(row_starts, columns, blocks, p, i, vector())
 
     @wp.kernel(module=module, enable_backward=False)
     def subtract_product(
-        first: int,
         row_starts: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         blocks: wp.array(dtype=matrix),
@@ -98,7 +99,7 @@ def operator_kernels(dim: int, dtype: str) -> SimpleNamespace:
         difference_out: wp.array(dtype=vector),
     ):
         """Writes b less the product with p, summed in float64: where they nearly cancel, float32 leaves noise."""
-        i = first + wp.tid()
+        i = wp.tid()
         total = double()
         for k in range(dim):
             total[k] = wp.float64(b[i][k])
@@ -265,18 +266,28 @@ class AssembledOperator(TangentOperator):
     def __init__(self, model: Model, external: bool) -> None:
         super().__init__(model, external)
         self.assembly = Assembly(model, self.free)
-        self.divided = model.team.size > 1
-        self._recordings = Recordings()
+        self._sliced = None
+        if model.device.is_cpu and model.point_count >= SLICED_POINTS:  # a GPU has lanes of its own
+            pattern = self.assembly.pattern
+            self._sliced = SlicedMatrix(
+                pattern.row_starts, pattern.columns, self.assembly.blocks, model.dtype, model.team
+            )
+        self.divided = self._sliced is not None and self._sliced.threads > 1
 
     def linearize(self, u, mass_weight, *, hessian="exact", friction=None, precondition=False) -> None:
         self.hessian = hessian
         self._linearize_couplings(u, friction)
         self._assemble(self.assembly, u, mass_weight)
+        if self._sliced is not None:
+            self._sliced.fill()
         if precondition:
             self._invert_diagonal(self.assembly)
 
     def apply(self, p, product_out) -> None:
-        self._launch_rows(self.kernels.multiply, [p], product_out)
+        if self._sliced is None:
+            self._launch(self.kernels.multiply, [*self._matrix(), p], [product_out])
+        else:
+            self._sliced.multiply(p, product_out)
         for block in self.averaged:
             block.add_coupling(p, product_out)
         if self.averaged and self.supports is not None:
@@ -286,39 +297,17 @@ class AssembledOperator(TangentOperator):
         if self.averaged:
             super().subtract_product(b, p, difference_out)
             return
-        self._launch_rows(self.kernels.subtract_product, [p, b], difference_out)
+        if self._sliced is None:
+            self._launch(self.kernels.subtract_product, [*self._matrix(), p, b], [difference_out])
+        else:
+            self._sliced.subtract_product(b, p, difference_out)
 
-    def _launch_rows(self, kernel: wp.Kernel, vectors: list[wp.array], out: wp.array) -> None:
-        """Launches a kernel over the rows of the matrix, divided among threads."""
-        own = self.assembly
-        matrix = [own.row_starts, own.columns, own.blocks]
-        if not self.divided:
-            self._launch(kernel, [0, *matrix, *vectors], [out])
-            return
-
-        def record() -> list[Job]:
-            parts = share(self.model.point_count, self.model.team.size)
-            return jobs(
-                [
-                    [
-                        wp.launch(
-                            kernel,
-                            len(part),
-                            inputs=[part.start, *matrix, *vectors],
-                            outputs=[out],
-                            device=self.model.device,
-                            record_cmd=True,
-                        )
-                    ]
-                    for part in parts
-                ]
-            )
-
-        key = (kernel, out.ptr, *(vector.ptr for vector in vectors))
-        self.model.team.run(self._recordings.get(key, record))
+    def _matrix(self) -> list[wp.array]:
+        return [self.assembly.row_starts, self.assembly.columns, self.assembly.blocks]
 
     def arrays(self) -> list[wp.array]:
-        return [*super().arrays(), *self.assembly.arrays()]
+        sliced = [] if self._sliced is None else self._sliced.arrays()
+        return [*super().arrays(), *self.assembly.arrays(), *sliced]
 
 
 class _UnassembledOperator(TangentOperator):

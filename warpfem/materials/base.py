@@ -32,10 +32,10 @@ class Constitutive:
         barrier: whether psi is infinite for J <= 0, so that a step may not lead there.
         differentiable: whether Warp can differentiate ``stress``: not if it calls ``wp.grad``, through which
             gradients silently do not flow.
-        branchless: whether ``stress`` has neither branches nor calls of library functions, so that the compiler can
-            work on several cells at once.
+        branchless: whether ``stress`` and ``stress_differential`` have neither branches nor calls of library
+            functions, so that the compiler can work on several cells at once.
         rotated_differential: ``(H, R, dH, parameters) -> dP``, ``stress_differential`` with the rotation R of F at
-            hand, which is then computed once for many dH. ``None`` where P holds no rotation.
+            hand, which is then computed once for many dH; it has no branches. ``None`` where P holds no rotation.
         direct_stress: ``(H, parameters) -> (P, holds)``, a form without branches of a ``stress`` that has some;
             ``holds`` is 1 where P is the stress, 0 where only ``stress`` knows it. ``None`` if there is no such form.
         volumetric: the measure theta if the energy is psi(F; mu, 0) + lam/2 theta^2, which averaged cells need; else
