@@ -202,6 +202,8 @@ def page(records: dict[str, dict]) -> str:
     cheap = sum(record["ratio"] is None or record["ratio"] <= CHEAP for record in found)
     refused = [record for record in measured if "refusal" in record]
     machines = dict.fromkeys(_machine(record["machine"]) for record in measured)
+    loads = [record["machine"]["load_average"] for record in measured if record["machine"]["load_average"] is not None]
+    load = f", with a load average of {min(loads):.1f} to {max(loads):.1f}" if loads else ""
     summary = (
         f"{within} of {len(found)} settings are within the error asked for, and {cheap} take no more than {CHEAP:g} "
         "times as long as the best of the sweep."
@@ -228,7 +230,7 @@ def page(records: dict[str, dict]) -> str:
         lines += _prose(f"{record['scene']}, {_percent(record['error'])}: refused. {_sentence(record['refusal'])}")
     lines += _prose(
         "'Tried' counts the settings that tuning has run, those of its reference not included; the sweep has "
-        f"{max((record['sweep'] for record in found), default=0)}. Measured on {'; '.join(machines)}."
+        f"{max((record['sweep'] for record in found), default=0)}. Measured on {'; '.join(machines)}{load}."
     )
     return "\n".join(lines).rstrip() + "\n"
 
