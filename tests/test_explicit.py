@@ -13,6 +13,7 @@ from warpfem.errors import SimulationError, TimeStepError
 from warpfem.materials import LinearElasticity, NeoHookean, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.model import Model
+from warpfem.profiling import observe_launches
 from warpfem.scene import Body, Scene
 from warpfem.simulation import Simulation
 from warpfem.solvers import SymplecticEuler, VelocityVerlet
@@ -256,3 +257,51 @@ def test_reactions_of_pins_raise_no_alarm(monkeypatch):
     for _ in range(3000):
         stepper.step(state, dt)
     assert len(alarms) < 30  # twice as fast each time
+
+
+@pytest.mark.parametrize("solver", EXPLICIT, ids=solver_name)
+def test_steps_that_come_again_are_graphs_with_the_same_bits(monkeypatch, solver):
+    """With all that a step may consist of: loads, contact, friction, damping, and a moving support."""
+    graphs = []
+    launch = wp.capture_launch
+    monkeypatch.setattr(wp, "capture_launch", lambda graph: (graphs.append(graph), launch(graph)))
+
+    def slide(rest, time):
+        return rest + np.array([time, 0.0])
+
+    body = slab(2, supports=[PrescribedMotion("left", slide)], velocity=(1.0, 0.0))
+    floor = Plane((0.0, 0.01), (0.0, 1.0), friction=0.3)
+    scene = Scene([body], solver, gravity=(0, -9.81), damping=0.5, obstacles=[floor])
+    results = []
+    for as_graph in (False, True):
+        _, state, stepper = ready(scene)
+        stepper._as_graph = as_graph
+        limit = stepper.stable_dt()
+        for fraction in (0.25, 0.125, 0.25):
+            advance(stepper, state, fraction * limit, 20)
+        results.append((state.displacement, state.velocity))
+        assert bool(graphs) == as_graph
+    assert len(graphs) > 30  # a step of another length, or in which points become fast, is launched first
+    np.testing.assert_array_equal(results[0], results[1])
+    assert np.abs(results[0][0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("solver", EXPLICIT, ids=solver_name)
+def test_kernels_that_are_observed_are_not_hidden_in_graphs(solver):
+    _, state, stepper = ready(Scene([slab(2)], solver))
+    with observe_launches() as seen:
+        advance(stepper, state, 1e-4, 5)
+    uses = {use.name: use.launches for use in seen.kernels.values()}
+    assert uses["kick_drift"] >= 5
+    assert not any("graph" in name for name in uses)
+
+
+def test_steps_of_automatic_length_come_again():
+    """What is left of a frame differs by roundings: as lengths of their own these would be launched and kept anew."""
+    simulation = Simulation(Scene([slab(2)], VelocityVerlet(), gravity=(0.0, -9.81), dt="auto", frames=2))
+    lengths = []
+    launch = simulation.stepper.step
+    simulation.stepper.step = lambda state, dt: (lengths.append(dt), launch(state, dt))[1]
+    *_, last = simulation.frames()
+    assert last.time == pytest.approx(2 / 24, abs=1e-10)
+    assert len(set(lengths)) < 0.2 * len(lengths)

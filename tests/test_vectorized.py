@@ -190,6 +190,25 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         assert limit == results[0][2]
 
 
+def test_threads_beside_a_body_without_strips_change_no_bit(monkeypatch):
+    """Such steps are not divided as a whole: threads share the forces of the body with strips alone."""
+    monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
+    bodies = [
+        wf.Body("body", MESHES["box"], wf.StableNeoHookean(E=1e5, nu=0.3), velocity=(0, 1, 0)),
+        wf.Body("small", MESHES["one cube"], wf.LinearElasticity(E=1e5, nu=0.3)),
+    ]
+    results = []
+    for threads in (1, 3):
+        model = wf.Model(wf.Scene(bodies, wf.SymplecticEuler(), gravity=(0, -9.81, 0)), device="cpu", threads=threads)
+        stepper, state = wf.SymplecticEuler().stepper(model), model.state()
+        assert [bool(block.vectorized) for block in model.blocks] == [True, False]
+        state.assign(displacement=1e-3 * np.random.default_rng(0).normal(size=(model.point_count, 3)))
+        for _ in range(5):
+            stepper.step(state, 1e-3)
+        results.append(state.displacement)
+    np.testing.assert_array_equal(*results)
+
+
 def test_threads_look_for_the_stability_limit_in_all_cells(monkeypatch):
     monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
     mesh, limits = MESHES["box"], []

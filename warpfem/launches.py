@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import warp as wp
 
+from warpfem.profiling import observing
 from warpfem.threads import Job
 
 MOST_RECORDED = 8
@@ -100,26 +102,21 @@ def jobs(
 
     Args:
         launches: of each thread, one after another; ``None``, which Warp records where there is no task, is left out.
-        context: what threads other than the calling one enter meanwhile.
+        context: what threads other than the calling one enter meanwhile; launches of its own are captured, too.
     """
 
     def job(own: list[wp.Launch], around: AbstractContextManager) -> Job:
-        replays: list[Callable[[], Any]] = [each.launch for each in own]
-        if own and (
-            len(launches) > 1 or len(own) > MOST_SINGLE
-        ):  # a graph takes Python's lock, for which threads wait, once
-            with wp.ScopedCapture(device=own[0].device) as capture:
-                for each in own:
-                    each.launch()
-            graph = capture.graph
-            replays = [lambda: wp.capture_launch(graph)]
-
         def launch() -> None:
             with around:
-                for replay in replays:
-                    replay()
+                for each in own:
+                    each.launch()
 
-        return launch
+        few = len(launches) == 1 and len(own) <= MOST_SINGLE
+        if few or not own or observing():
+            return launch
+        with wp.ScopedCapture(device=own[0].device) as capture:  # a graph takes Python's lock once, which others want
+            launch()
+        return functools.partial(wp.capture_launch, capture.graph)
 
     return [
         job([each for each in own if each is not None], context() if thread else nullcontext())

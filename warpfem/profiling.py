@@ -11,7 +11,9 @@ from unittest.mock import patch
 import warp as wp
 
 GRAPH = ("iteration of conjugate gradients (a graph of the kernels)", "warpfem.graph")
-"""Name and module by which a graph of kernels is counted: no other is captured."""
+"""Name and module by which a graph of kernels is counted: others are not made while launches are observed."""
+
+_observers = 0
 
 
 @dataclass
@@ -55,12 +57,18 @@ class Launches:
         return {name for name, _ in self.kernels}
 
 
+def observing() -> bool:
+    """Whether launches are observed, so that kernels should be launched one by one."""
+    return _observers > 0
+
+
 @contextmanager
 def observe_launches(device: wp.DeviceLike = None) -> Iterator[Launches]:
     """Counts and times all kernel launches inside the block, each waited for on ``device``.
 
     A graph of kernels counts as one kernel.
     """
+    global _observers
     seen = Launches()
     launch, replay, replay_graph = wp.launch, wp.Launch.launch, wp.capture_launch
 
@@ -90,4 +98,8 @@ def observe_launches(device: wp.DeviceLike = None) -> Iterator[Launches]:
         patch.object(wp.Launch, "launch", observed_replay),
         patch.object(wp, "capture_launch", observed_graph),
     ):
-        yield seen
+        _observers += 1
+        try:
+            yield seen
+        finally:
+            _observers -= 1

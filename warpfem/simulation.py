@@ -20,6 +20,10 @@ from warpfem.scene import Scene
 from warpfem.solvers.base import Solver, StepReport, require_finite, worst_cell
 from warpfem.solvers.error_control import controlled_step
 
+SAME_DT = 1e-10
+"""Relative difference to which ``dt="auto"`` keeps the last step's length, so that what was recorded for it serves
+again: what is left of a frame is known to some roundings, and less than this per step changes no end of a frame."""
+
 AUTO_FRACTION = 0.6
 """The part of the explicit stability limit that ``dt="auto"`` takes: deformation stiffens cells."""
 
@@ -283,7 +287,8 @@ class Simulation:
                 self._follow_limit()
             assert summary.stable_dt is not None
             parts = math.ceil(left / (AUTO_FRACTION * summary.stable_dt) - 1e-9)
-            self._set_dt(left / parts)
+            if not math.isclose(left / parts, self.dt, rel_tol=SAME_DT):
+                self._set_dt(left / parts)
         self._step()
 
     def _set_dt(self, dt: float) -> None:
