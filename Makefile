@@ -3,7 +3,8 @@
 # make slow   the long checks too
 # make verify the verification suite, which writes docs/accuracy.md
 # make bench  the benchmarks beside other codes, which write docs/performance.md
-# make trade  the studies of speed against accuracy, which write docs/trade.md
+# make trade  the studies of speed against accuracy, which write docs/trade.md, in about 40 minutes on one core
+# make tuning settings that are found beside the best of sweeps, which write docs/tuning.md
 # make docs   the documentation, in docs/_build
 # make gallery the pictures of the documentation, from the shipped scenes
 # make lint   style and types
@@ -13,7 +14,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PARALLEL := --numprocesses auto --dist loadfile # tests of a file share kernels
 
-.PHONY: demo test slow verify bench trade docs gallery lint clean
+.PHONY: demo test slow verify bench trade tuning docs gallery lint clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -48,6 +49,9 @@ bench: $(VENV)/installed
 
 trade: $(VENV)/extras
 	$(BIN)/python benchmarks/trade.py --out docs/trade.md
+
+tuning: $(VENV)/installed
+	$(BIN)/python benchmarks/tuning.py --out docs/tuning.md
 
 docs: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'

@@ -16,7 +16,7 @@ from warpfem.cli import parser
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-GENERATED = {"accuracy.md", "performance.md", "stability.md", "trade.md", "gpu.md"}
+GENERATED = {"accuracy.md", "performance.md", "stability.md", "trade.md", "tuning.md", "gpu.md"}
 OPTIONAL = ("meshio", "newton")
 
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

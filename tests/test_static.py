@@ -10,7 +10,7 @@ from warpfem.materials import NeoHookean, StableNeoHookean
 from warpfem.mesh import Mesh
 from warpfem.model import Model
 from warpfem.scene import Body, Scene
-from warpfem.solvers import BackwardEuler, StaticEquilibrium
+from warpfem.solvers import BackwardEuler, Quasistatic, StaticEquilibrium
 
 
 def solved(body, **settings):
@@ -304,3 +304,44 @@ def test_an_unstable_equilibrium_is_pointed_out():
     state = model.state()
     (last,) = StaticEquilibrium().increments(model, state, time=0.1)
     assert last.stable
+
+
+# ---- one equilibrium after the other
+
+
+def test_quasistatic_steps_end_in_equilibria_and_do_not_repeat_what_they_found():
+    def pull(rest, time):
+        return rest + np.array([min(time, 0.2), 0.0])
+
+    body = slab(2, supports=[Pin("left"), PrescribedMotion("right", pull)], velocity=(3.0, 0.0))
+    scene = Scene([body], Quasistatic(tolerance=1e-9), gravity=(0.0, -50.0), damping=2.0)
+    model = Model(scene, device="cpu", dtype="float64")
+    state, expected = model.state(), model.state()
+    stepper = scene.solver.stepper(model)
+    iterations = []
+    for time in (0.1, 0.2, 0.3):
+        iterations.append(stepper.step(state, 0.1).newton_iterations)
+        assert state.time == pytest.approx(time)
+        StaticEquilibrium(tolerance=1e-9).solve(model, expected, time)
+        np.testing.assert_allclose(state.displacement, expected.displacement, atol=1e-7)
+    assert iterations[0] > 0 < iterations[1] and iterations[2] == 0
+    assert not state.velocity.any()
+
+
+def test_quasistatic_steps_between_pins_solve_once_until_the_state_is_another():
+    scene = Scene([slab(2, supports=[Pin("left")])], Quasistatic(), gravity=(0.0, -50.0))
+    model = Model(scene, device="cpu", dtype="float64")
+    state = model.state()
+    stepper = scene.solver.stepper(model)
+    assert stepper.step(state, 0.1).residual > 0.0 == stepper.step(state, 0.1).residual
+    sag = state.displacement
+    state.assign(displacement=0.9 * sag)
+    assert stepper.step(state, 0.1).newton_iterations > 0
+    assert state.time == pytest.approx(0.3)
+    np.testing.assert_allclose(state.displacement, sag, atol=1e-3 * np.abs(sag).max())
+
+
+def test_quasistatic_steps_need_supports():
+    model = Model(Scene([slab(2)], Quasistatic(), gravity=(0.0, -1.0)), device="cpu", dtype="float64")
+    with pytest.raises(SceneError, match="can move freely"):
+        model.scene.solver.stepper(model)

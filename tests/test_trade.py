@@ -18,14 +18,14 @@ from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.errors import OutputError, SceneError, SimulationError
 from warpfem.trade.axes import kind_of, mesh_control, parse_axes, settings_of
 from warpfem.trade.executors import cluster_executor, local_executor
-from warpfem.trade.extrapolation import MOST_ORDER, extrapolate, observed_order
+from warpfem.trade.extrapolation import MOST_ORDER, extrapolate, observed_order, order_text
 from warpfem.trade.front import answer, candidates, front
 from warpfem.trade.ladders import Part
 from warpfem.trade.measure import measure
 from warpfem.trade.outcome import Order, Outcome
 from warpfem.trade.problem import Problem, Setting
 from warpfem.trade.process import run_order
-from warpfem.trade.reference import Reference, build_reference
+from warpfem.trade.reference import DEFAULT_STIFFNESS, Reference, build_reference
 from warpfem.trade.store import Store
 from warpfem.trade.study import Point, Study, difference
 
@@ -198,11 +198,37 @@ def test_nothing_is_extrapolated_from_what_does_not_converge(values, remark):
 def test_orders_have_bounds():
     assert observed_order(1.01, [1.0, 0.5, 0.25]) is None
     assert observed_order(1e9, [1.0, 0.5, 0.25]) == MOST_ORDER
-    assert extrapolate([np.ones(1), np.ones(1) * 1.5], [1.0, 0.5]).band == 0.5
+    assert extrapolate([np.ones(1), np.ones(1) * 1.5], [1.0, 0.5]).band == 0.75
     assert "rounding" in extrapolate([np.zeros(1), np.ones(1), np.ones(1)], [1.0, 0.5, 0.2]).remark
     same = extrapolate([np.ones(1), np.ones(1) * 1.5, np.ones(1) * 1.75], [0.5, 0.5, 0.25])
-    assert (same.order, same.band) == (None, 0.25)
+    assert (same.order, same.band) == (None, 0.375)
     assert "do not get finer" in same.remark
+
+
+@pytest.mark.parametrize("cells", [(1, 2, 4, 6), (2, 4, 8, 12), (4, 6, 8, 12)])
+@pytest.mark.parametrize("part", [0.1, 0.5, 2.0])
+def test_with_four_levels_the_band_is_that_of_the_limit(cells, part):
+    """As at a clamped edge: an error of order 1.42 beside one that falls faster."""
+    sizes = [1.0 / n for n in cells]
+    levels = [np.array([[h**1.42 + part * h**3]]) for h in sizes]
+    found = extrapolate(levels, sizes)
+    assert abs(found.value) <= found.band
+    assert found.band <= 0.4 * abs(found.value - levels[-1]) + 1.3 * abs(found.value)
+
+
+@pytest.mark.parametrize("common", [0.0, 0.3])
+def test_errors_of_many_directions_have_a_band(common):
+    random, sizes = np.random.default_rng(1), [1.0 / n for n in (2, 4, 8, 12)]
+    same = common * random.standard_normal((500, 2))
+    levels = [h * (same + random.standard_normal((500, 2))) for h in sizes]
+    found = extrapolate(levels, sizes)
+    off = np.sqrt((found.value**2).sum(axis=-1).mean())
+    assert found.order is None
+    assert off <= found.band <= 4.0 * off
+
+
+def test_an_order_beyond_the_claimed_one_is_told_so():
+    assert (order_text(1.84), order_text(MOST_ORDER)) == ("1.8", "4 or more")
 
 
 # ---- fronts
@@ -240,7 +266,11 @@ def test_the_front_and_its_answers():
     none = answer(ordered, own, "l2", 5e-4)
     assert none.candidate is None
     assert "No setting of the sweep is within 0.05 %" in none.sentence
-    assert "the reference itself may be off by 0.01 %" in answer(ordered, own, "l2", 2e-4).sentence
+    coarse = reference(4e-4)
+    unclear = candidates([point(0.2, 1.0), point(0.001, 400.0)], coarse, "l2")
+    assert "the reference itself may be off by 0.04 %" in answer(unclear, coarse, "l2", 1e-3).sentence
+    outside = candidates([point(0.2, 1.0), point(0.002, 400.0)], coarse, "l2")
+    assert "No setting of the sweep is within 0.1 %" in answer(outside, coarse, "l2", 1e-3).sentence
     assert "every setting failed" in answer([], own, "l2", 0.1).sentence
     assert candidates(points, own, "tip") == []  # no setting has a value of it
 
@@ -274,7 +304,7 @@ def test_the_next_factor_costs_more_than_the_answer_or_is_not_told(errors, targe
     found = answer(ordered, own, "l2", target)
     assert (found.candidate is not None, found.next_seconds is not None) == (within, told)
     assert found.next_seconds is None or found.next_seconds > 4.0
-    assert told or "the front does not tell" in found.sentence
+    assert told or "the front does not tell what that costs: its last setting may be within" in found.sentence
 
 
 def test_an_error_of_nothing_is_no_part_of_a_power_law():
@@ -358,6 +388,31 @@ def test_runs_are_those_of_the_scene_and_of_what_it_imports(bar, tmp_path):
     assert Problem.of(bar).key(Setting()) == before
 
 
+def test_runs_are_those_of_the_meshes_that_a_scene_reads(bar, tmp_path, monkeypatch):
+    meshio = pytest.importorskip("meshio")
+    path = tmp_path / "plate.vtk"
+    mesh = wf.Mesh.rectangle((2, 1), (2, 1)).with_point_set("left", lambda x: x[:, 0] == 0.0)
+
+    def write(scale: float) -> None:
+        points = np.pad(scale * mesh.points, ((0, 0), (0, 1)))
+        meshio.Mesh(points, [("triangle", mesh.cells)]).write(path)
+
+    write(1.0)
+    read = f'wf.load_mesh({str(path)!r}).with_point_set("left", lambda x: x[:, 0] == 0.0)'
+    bar.write_text(BAR.replace("wf.Mesh.rectangle((2, 1), (2 * cells, cells))", read))
+    own = study(bar, tmp_path / "a", Here())
+    assert [file for file, _ in own.problem.files] == [str(path)]
+    write(1.5)
+    assert study(bar, tmp_path / "a", Here()).problem.key(Setting()) != own.problem.key(Setting())
+    outcome = measure(Order(own.problem, Setting(), own.places, 1, 100.0, "serial"))
+    assert f"{path} is not the file that the study was begun with" in outcome.failure
+    write(1.0)
+    monkeypatch.setattr("warpfem.trade.problem.code_digest", lambda: "another")
+    assert study(bar, tmp_path / "a", Here()).problem.key(Setting()) != own.problem.key(Setting())
+    outcome = measure(Order(own.problem, Setting(), own.places, 1, 100.0, "serial"))
+    assert "not the code of warpfem that the study was begun with" in outcome.failure
+
+
 def test_all_frames_are_not_run_again_as_the_first_ones(bar, tmp_path, monkeypatch):
     monkeypatch.setattr("warpfem.trade.study.run_order", fake)
     runs = Here()
@@ -365,6 +420,20 @@ def test_all_frames_are_not_run_again_as_the_first_ones(bar, tmp_path, monkeypat
     for part in (own, own.shortened(own.scene.frames), own.shortened(3)):
         part.run([Setting()])
     assert len(runs.labels) == 2
+
+
+def test_places_stand_for_the_same_volume_but_for_few_of_small_bodies(tmp_path):
+    path = tmp_path / "three.py"
+    path.write_text(
+        "import warpfem as wf\n"
+        "def scene():\n"
+        "    sizes = {'large': 3.0, 'middle': 1.0, 'small': 0.04}\n"
+        "    meshes = {name: wf.Mesh.rectangle((size, 1), (2, 2)) for name, size in sizes.items()}\n"
+        "    bodies = [wf.Body(name, mesh, wf.LinearElasticity(E=1e5, nu=0.3)) for name, mesh in meshes.items()]\n"
+        "    return wf.Scene(bodies, wf.BackwardEuler())\n"
+    )
+    counts = [len(own) for own in Study(Problem.of(path), Store(tmp_path / "runs"), Here()).places]
+    assert counts == [297, 99, 10]
 
 
 def test_motions_are_compared_at_the_same_places_though_meshes_come_out_different(bar, tmp_path):
@@ -492,6 +561,42 @@ def test_the_reference_is_within_its_band_of_a_finer_one(bar, tmp_path, in_proce
     assert found.band("l2") <= best / 4.0
     assert 1.0 < found.parts["l2"]["space"].order < 4.0
     assert 1.0 < found.parts["l2"]["time"].order < 4.0
+
+
+DROP = """
+import warpfem as wf
+
+def scene(cells: int = 2, stiffness: float | None = 1e6) -> wf.Scene:
+    mesh = wf.Mesh.rectangle((1, 1), (cells, cells), origin=(0, 0.05))
+    block = wf.Body("block", mesh, wf.LinearElasticity(E=1e5, nu=0.3))
+    floor = wf.Plane(point=(0, 0), normal=(0.1, 1), friction=0.3, stiffness=stiffness)
+    return wf.Scene([block], wf.BackwardEuler(), gravity=(0, -9.81), damping=2.0, fps=20, frames=12, obstacles=[floor])
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "first", "within", "cells"),
+    [(BAR, 1, 2e-3, (1, 2, 4, 6, 8)), (DROP, 2, 1e-2, (2, 4, 8))],
+    ids=["a clamped edge", "an impact"],
+)
+def test_the_band_holds_against_a_far_finer_run(bar, tmp_path, in_process, text, first, within, cells):
+    bar.write_text(text)
+    own = study(bar, tmp_path / "a", Here())
+    (coarse,) = own.run([Setting.of(cells=first, element="P2")])
+    found = build_reference(own, mesh_control(own.problem), [coarse], within=within, explicit=True)
+    assert [int(rung.setting["cells"]) for rung in found.ladders["space"]] == list(cells)
+    exact = {"dtype": "float64", "solver": "velocity_verlet", "dt": "auto"}
+    (truth,) = own.run([Setting.of(cells=4 * cells[-1], element="P2", **exact)])
+    for name in found.names:
+        assert found.errors(truth.first)[name] <= found.band(name) <= 0.5 * found.errors(coarse.first)[name]
+
+
+def test_the_default_stiffness_of_obstacles_is_told_of(bar, tmp_path, monkeypatch):
+    bar.write_text(DROP.replace("= 1e6", "= None"))
+    monkeypatch.setattr("warpfem.trade.study.run_order", fake)
+    own = study(bar, tmp_path, Here())
+    found = build_reference(own, mesh_control(own.problem), own.run([Setting.of(cells=1)]), explicit=True)
+    assert found.remarks == [DEFAULT_STIFFNESS]
 
 
 def test_the_steps_of_the_reference_are_not_those_of_explicit_settings(bar, tmp_path, monkeypatch):

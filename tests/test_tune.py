@@ -1,7 +1,9 @@
 """Tuning: the search for the cheapest setting within an error, and the files of settings."""
 
+import importlib.util
 import json
 import shlex
+import sys
 import tomllib
 import zlib
 from concurrent.futures import Executor, Future
@@ -16,6 +18,7 @@ from warpfem.commands.session import FAILED, OK, WRONG_USE
 from warpfem.commands.tune import _tune_command
 from warpfem.errors import SceneError, SimulationError
 from warpfem.motion import Motion
+from warpfem.solvers import Quasistatic
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import mesh_control
 from warpfem.trade.outcome import Order, Outcome
@@ -41,15 +44,16 @@ def scene(cells: int = 4, E: float = 1e5, dt: float = 1 / 40) -> wf.Scene:
 # ---- the search for one level
 
 
-def levels(constant: float, power: float, cost: float = 1.0, failing: int = 0):
-    """Trials of n steps of a frame with an error of constant n^-power; those of few steps fail."""
+def levels(constant: float, power: float, cost: float = 1.0, failing: int = 0, rounding: float = 0.0):
+    """Trials of n steps of a frame with an error of constant n^-power; those of few steps fail, float32 errs more."""
 
     def run(setting: Setting) -> Trial:
         steps = steps_of(setting, 10.0)
         run.tried.append(steps)
         failed = steps <= failing
         outcome = Outcome("diverged" if failed else "", seconds=[cost * steps])
-        return Trial(setting, Point(setting, (outcome,)), np.inf if failed else constant * steps**-power)
+        error = constant * steps**-power + (0.0 if "dtype" in setting else rounding)
+        return Trial(setting, Point(setting, (outcome,)), np.inf if failed else error)
 
     run.tried = []
     return run
@@ -86,7 +90,13 @@ def test_levels_that_fail_are_refined():
 def test_a_search_whose_errors_do_not_fall_ends():
     run = levels(1.0, 0.01)
     assert search(run, 1e-2, 1.0) is None
-    assert len(run.tried) == 3
+    assert len(run.tried) == 4  # the last in float64
+
+
+def test_a_search_that_float32_stops_goes_on_in_float64():
+    run = levels(1.0, 1.0, rounding=2e-2)
+    assert 100 <= search(run, 1e-2, 1.0, start=40) <= 130
+    assert len(run.tried) <= 10
 
 
 def test_a_search_that_would_cost_too_much_ends():
@@ -106,10 +116,21 @@ class Law:
         late: by what errors grow after half of the frames.
         noise: errors that no refinement reduces.
         opposed: the part of the errors in time that makes up for those in space.
+        inertia: the error of equilibria in place of motion.
+        bend: the error of linear elasticity, which takes half the time.
     """
 
-    def __init__(self, stiffness: float = 20.0, late: float = 1.0, noise: float = 0.0, opposed: float = 0.0) -> None:
+    def __init__(
+        self,
+        stiffness: float = 20.0,
+        late: float = 1.0,
+        noise: float = 0.0,
+        opposed: float = 0.0,
+        inertia: float = 1.0,
+        bend: float = 1.0,
+    ) -> None:
         self.stiffness, self.late, self.noise, self.opposed = stiffness, late, noise, opposed
+        self.inertia, self.bend = inertia, bend
         self.runs = 0
 
     def __call__(self, order: Order) -> Outcome:
@@ -126,15 +147,20 @@ class Law:
             steps = scene.frames * max(1, round(interval / scene.dt))
             in_time = {1: 1.0, 2: 0.3, 3: 0.15}[solver.order] * (scene.frames * interval / steps) ** solver.order / 0.05
             seconds = steps * 1e-3 * (1.0 + 0.1 * work) * solver.order * (0.4 if solver.max_iterations == 1 else 1.0)
+        elif isinstance(solver, Quasistatic):
+            steps, in_time, seconds = scene.frames, 10.0 * self.inertia, 1e-3 * (1.0 + 0.1 * work)
         else:
             steps = round(scene.frames * self.stiffness * (2 if quadratic else 1) / h)
             in_time = 1e-5
             seconds = steps * 1e-4 * (1.0 + 0.02 * work)
+        linear = isinstance(body.material, wf.LinearElasticity)
+        seconds *= 0.5 if linear else 1.0
         times = interval * np.arange(scene.frames + 1)
         later = np.where(times > 4.5 * interval, self.late, 1.0)
         chance = np.random.default_rng(zlib.crc32(setting.canonical.encode())).normal(size=2)
         own = np.array([0.5 * in_space, (1.0 - self.opposed) * 0.1 * in_time]) + self.noise * chance
         own[0] -= self.opposed * 0.1 * in_time
+        own[1] += self.bend if linear else 0.0
         places = sum(map(len, order.places))
         motion = np.sin(times)[:, None, None] * (1.0 + later[:, None, None] * own) * np.ones((1, places, 1))
         return Outcome(
@@ -219,6 +245,46 @@ def test_what_is_found_is_within_the_error_at_little_more_than_the_least_cost(
         assert found.seen < found.unseen
 
 
+def test_what_errs_more_only_on_the_frames_of_the_search_is_found(bar, monkeypatch):
+    law = Law(5.0, late=0.1)
+    study = study_of(bar, law, monkeypatch)
+    found = tune(study, mesh_control(study.problem), "l2", 0.003, repeats=1)
+    assert found.unseen < 0.003 < found.seen
+    assert true_error(found.point.first, "l2") <= 0.003
+    assert found.point.seconds <= 1.2 * sweep(study, law, 0.003, "l2")
+
+
+@pytest.mark.parametrize("inertia", [1e-4, 0.03])
+def test_equilibria_take_the_place_of_motion_only_where_they_are_accurate_enough(bar, monkeypatch, inertia):
+    law = Law(inertia=inertia)
+    study = study_of(bar, law, monkeypatch)
+    found = tune(study, mesh_control(study.problem), "l2", 0.01, repeats=1)
+    assert (found.setting["scene.solver"] == "quasistatic") == (inertia < 0.003)
+    assert true_error(found.point.first, "l2") <= 0.01
+    if inertia < 0.003:
+        assert found.parts["model"] == pytest.approx(inertia * share_of_errors(found.point.first, 1.0), rel=0.05)
+        assert "time" not in found.parts
+
+
+@pytest.mark.parametrize("bend", [1e-4, 0.03])
+def test_linear_elasticity_is_taken_only_where_it_is_accurate_enough(bar, monkeypatch, bend):
+    law = Law(5.0, late=0.1, bend=bend)
+    study = study_of(bar, law, monkeypatch)
+    found = tune(study, mesh_control(study.problem), "l2", 0.01, repeats=1)
+    assert ("scene.material" in found.setting) == (bend < 0.003)
+    assert true_error(found.point.first, "l2") <= 0.01
+    if bend < 0.003:  # told over all frames, not over those of the search
+        assert found.parts["model"] == pytest.approx(bend * share_of_errors(found.point.first, 0.1), rel=0.05)
+
+
+def share_of_errors(outcome: Outcome, late: float) -> float:
+    """The root mean square of one component of the motion, in late frames times a factor, over the peak of the two."""
+    motion = np.sin(outcome.times)
+    return float(
+        np.sqrt(np.mean((np.where(outcome.times > 4.5 / 20, late, 1.0) * motion) ** 2)) / np.sqrt(2.0) / motion.max()
+    )
+
+
 def test_tuning_that_was_interrupted_goes_on(bar, monkeypatch):
     class Interrupted(Law):
         def __call__(self, order):
@@ -260,7 +326,7 @@ def test_the_command_writes_settings_that_run_takes(bar, tmp_path, monkeypatch, 
     assert found["estimate"]["error"] + found["estimate"]["band"] <= 0.02
     path = tmp_path / "output" / "bar.settings.toml"
     own = tomllib.loads(path.read_text())
-    assert own["scene"] == "bar.py" and own["parameters"]["E"] == 2e5
+    assert own["scene"] == "bar.py" and own["parameters"]["E"] == "2e5"
     assert own["changes"]["solver"] == "velocity_verlet"
     assert own["estimate"]["command"] == f"warpfem tune {bar} --error 0.02 --set E=2e5"
     choice = SettingsFile.read(path).choose(path, bar, {})
@@ -308,13 +374,40 @@ def test_settings_come_back_as_they_were_written(bar, settings):
     text = settings.read_text()
     assert text.startswith("# for people\n") and "cells = 3\n" in text and 'dt = "1/60"' in text
     read = SettingsFile.read(settings)
-    assert read.parameters == {"E": "300000.0", "cells": "3"}
+    assert read.parameters == {"E": "3e5", "cells": "3"}
     assert read.notes["estimate"] == {"error": 0.008, "quantity": "l2"}
     choice = read.choose(settings, bar, {})
     scene, body = choice.scene, choice.scene.bodies[0]
     assert (choice.dtype, scene.solver.name, scene.solver.tolerance) == ("float64", "sdirk2", 1e-3)
     assert (scene.dt, body.element) == (pytest.approx(1 / 60), "quadratic")
     assert body.mesh.cell_count == 2 * 6 * 3 and body.material.E == pytest.approx(3e5)
+
+
+TEXTS = [
+    "3",
+    "-2.5",
+    "1e-05",
+    "3e5",
+    "1.50",
+    "007",
+    "1e400",
+    "9" * 30,
+    "9" * 5000,
+    "-0",
+    "true",
+    "True",
+    "nan",
+    "[3]",
+    "1/60",
+]
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text[:8])
+def test_texts_come_back_as_they_are(bar, tmp_path, text):
+    path = tmp_path / "texts.toml"
+    SettingsFile("bar.py", "", {"kind": text}, {"dt": text}).write(path, [])
+    read = SettingsFile.read(path)
+    assert (read.parameters, read.changes) == ({"kind": text}, {"dt": text})
 
 
 def test_the_command_line_wins_over_settings(bar, settings):
@@ -377,6 +470,16 @@ def test_run_and_static_take_settings(bar, settings, tmp_path, capsys):
     assert (summary["steps"], summary["dtype"]) == (3, "float32")
     assert main([*run, "--overwrite", "--json", "--set", "dt=0.05"]) == OK
     assert json.loads(capsys.readouterr().out)["steps"] == 1
+
+
+def test_the_page_of_the_benchmark_is_that_of_its_results(monkeypatch):
+    root = Path(__file__).parent.parent
+    spec = importlib.util.spec_from_file_location("tuning", root / "benchmarks" / "tuning.py")
+    benchmark = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "tuning", benchmark)
+    spec.loader.exec_module(benchmark)
+    results = json.loads((root / "docs" / "tuning.json").read_text())
+    assert benchmark.page(results) == (root / "docs" / "tuning.md").read_text()
 
 
 @pytest.mark.slow

@@ -166,6 +166,8 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     for module in ("model", "solvers.explicit"):
         monkeypatch.setattr(f"warpfem.{module}.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
+    if not isinstance(solver, wf.BackwardEuler):
+        monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)  # as if there were many bodies
     monkeypatch.setattr(explicit, "WINDOW", 64)
     monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
     monkeypatch.setattr("warpfem.linear.operators.SLICED_POINTS", 64)

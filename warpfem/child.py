@@ -15,7 +15,9 @@ import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -44,6 +46,20 @@ serve(*arguments)
 _ENVIRONMENT = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
+_noted: ContextVar[set[Path] | None] = ContextVar("files read", default=None)
+
+
+@contextmanager
+def noting_files() -> Iterator[set[Path]]:
+    """The files that are read in children by what is done inside the block."""
+    files: set[Path] = set()
+    token = _noted.set(files)
+    try:
+        yield files
+    finally:
+        _noted.reset(token)
+
+
 class ChildError(Exception):
     """A child did not do its work: says how it ended."""
 
@@ -57,6 +73,8 @@ def read_in_child(read: Callable[[str], T], path: str | os.PathLike[str], error:
         error: raised if the child dies, takes too long or raises anything but a :class:`WarpfemError`.
     """
     path = existing(path, error)
+    if (files := _noted.get()) is not None:
+        files.add(path.absolute())
     try:
         return call_in_child(read, path, MIN_SECONDS + SECONDS_PER_BYTE * _size(path))
     except WarpfemError:

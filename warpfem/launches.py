@@ -97,12 +97,14 @@ class Recordings:
 def jobs(
     launches: Sequence[Iterable[wp.Launch | None]],
     context: Callable[[], AbstractContextManager] = nullcontext,
+    as_graphs: bool = True,
 ) -> list[Job]:
     """A job of launches for each thread.
 
     Args:
         launches: of each thread, one after another; ``None``, which Warp records where there is no task, is left out.
         context: what threads other than the calling one enter meanwhile; launches of its own are captured, too.
+        as_graphs: whether to make graphs of them where that pays; a graph cannot be a part of another.
     """
 
     def job(own: list[wp.Launch], around: AbstractContextManager) -> Job:
@@ -111,8 +113,7 @@ def jobs(
                 for each in own:
                     each.launch()
 
-        few = len(launches) == 1 and len(own) <= MOST_SINGLE
-        if few or not own or observing():
+        if not own or not as_graphs or observing() or (len(launches) == 1 and len(own) <= MOST_SINGLE):
             return launch
         with wp.ScopedCapture(device=own[0].device) as capture:  # a graph takes Python's lock once, which others want
             launch()

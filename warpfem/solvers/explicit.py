@@ -119,7 +119,8 @@ class _Passes:
                 launches.append(force.record_sums(self._force, points))
         for launches, points in zip(second, self._points, strict=True):
             launches.append(kick_drift(state, points, *settings))
-        return jobs(first, SubnormalsFlushed), jobs(second, SubnormalsFlushed)
+        as_graphs = self.threads > 1  # on one thread the whole step is a graph
+        return jobs(first, SubnormalsFlushed, as_graphs), jobs(second, SubnormalsFlushed, as_graphs)
 
 
 class _ExplicitStepper(Stepper):

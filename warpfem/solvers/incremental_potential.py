@@ -232,6 +232,12 @@ class IncrementalPotential:
             self.add_scaled(force, 1.0, part, force)
         return self._free_norms(force), np.max(sizes, axis=0)
 
+    def internal_norms(self, u: wp.array) -> np.ndarray:
+        """Each body's norm of the internal force, where held too [N]."""
+        self.part.zero_()
+        self.model.add_internal_force(u, self.part)
+        return self._norms(self.part)
+
     def _free_norms(self, vector: wp.array) -> np.ndarray:
         """Sets the held components of a vector to zero; returns its norm over each body's points."""
         if self.model.supports is not None:

@@ -235,12 +235,17 @@ class Newton:
     def _rounded(self, report: StepReport, scales: np.ndarray, roundings: np.ndarray) -> StepReport:
         """The end of a step of which rounding hides the rest: good if that is little, or if no force acts at all."""
         model, relative = self.model, report.residual
-        all_is_noise = (scales <= STAGNANT_ROUNDINGS * roundings).all()
+        noise = STAGNANT_ROUNDINGS * roundings
+        all_is_noise = (scales <= noise).all()
         at_rest = all_is_noise and model.dead_load is None and model.contact_energy(self.u) == 0.0
         note = f"resolved only to the rounding of {model.dtype}"
         settled = relative <= SETTLED_LIMIT and self._correction() <= ROUNDING_LIMIT
-        converged = bool(at_rest or relative <= ROUNDING_LIMIT or settled)
+        converged = bool(at_rest or relative <= ROUNDING_LIMIT or settled or self._is_small_beside_reactions(noise))
         return replace(report, converged=converged, rounded=True, note=note)
+
+    def _is_small_beside_reactions(self, noise: np.ndarray) -> bool:
+        """Whether forces are within the tolerance of those that hold each body where supports strain it."""
+        return bool((noise <= self.settings.tolerance * self.potential.internal_norms(self.u)).all())
 
     def _correction(self) -> float:
         """The size of the last linear solve's solution, relative to the increment."""

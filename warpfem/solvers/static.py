@@ -145,7 +145,7 @@ class StaticEquilibrium:
         end = state.time if time is None else time
         straight = model.supports is None or model.supports.bend(end, 0.0, 1.0) <= MOST_BEND
         if self.load_steps == 1 and straight:
-            newton = _StaticNewton(model, self._newton(self.max_iterations), static=True)
+            newton = StaticNewton(model, self._newton(self.max_iterations), static=True)
             if model.supports is not None:
                 model.supports.advance(end, 0.0)
             try:
@@ -173,7 +173,7 @@ class StaticEquilibrium:
             loaded.dead_load = wp.clone(model.dead_load)
             full = model.dead_load.numpy().copy()
         iterations = min(self.max_iterations, INCREMENT_ITERATIONS)
-        newton = _StaticNewton(loaded, self._newton(iterations), static=True, watchful=True)
+        newton = StaticNewton(loaded, self._newton(iterations), static=True, watchful=True)
         state.u.zero_()
         state.v.zero_()
         longest = 1.0 / self.load_steps
@@ -260,7 +260,7 @@ def _require_sound(model: Model, u: wp.array) -> None:
             )
 
 
-class _StaticNewton(Newton):
+class StaticNewton(Newton):
     """Newton's method on the potential energy.
 
     Attributes:

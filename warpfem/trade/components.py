@@ -5,7 +5,8 @@ Each is the difference that one change makes. Of implicit schemes:
 - space: the setting's mesh with the reference's time steps, against the limit in space with those;
 - time: its scheme and step on the reference's coarsest mesh, against the limit in time on that;
 - algebra: the setting itself, against itself in float64 with a tolerance of 1e-8;
-- model: what it changes of the problem, on the reference's coarsest mesh, against that without.
+- model: what it changes of the problem, on the reference's coarsest mesh, against that without; equilibria in place of
+  motion, which are not told from errors in time, are among that.
 
 Where the reference takes explicit steps, those of the setting are halved instead, which leaves a part 2^-p of their
 error, p being their order: what that changes is in time, the rest in space.
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from warpfem.solvers import Solver
+from warpfem.solvers import Quasistatic, Solver
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import MeshControl, kind_of
 from warpfem.trade.outcome import Outcome
@@ -60,6 +61,8 @@ class _Separator:
         self.kinds = {name: kind_of(name, mesh) for name, _ in point.setting}
         self.shared = reference.ladders["space"][0].setting  # the coarsest mesh and the step of all meshes
         self.algebra = point.setting.changed(**algebra)
+        in_time = {name for name, _ in self.shared if name not in mesh.names and name != f"{FORCED}element"}
+        self.space = self.shared.only(in_time).changed(**self._own("space"))  # its mesh, with steps of the reference
         model = self._own("model")
         self.model = self.shared.changed(**model) if model else None
 
@@ -100,8 +103,6 @@ class _Separator:
 class _Implicit(_Separator):
     def __init__(self, study: Study, mesh: MeshControl, reference: Reference, point: Point) -> None:
         super().__init__(study, mesh, reference, point, FINE_ALGEBRA)
-        in_time = {name for name, _ in self.shared if name not in mesh.names and name != f"{FORCED}element"}
-        self.space = self.shared.only(in_time).changed(**self._own("space"))
         plain = dict.fromkeys((f"{FORCED}solver", f"{FORCED}dt"))
         self.time = self.shared.changed(**plain).changed(**self._own("time"))
 
@@ -134,8 +135,24 @@ class _Explicit(_Separator):
         ]
 
 
+class _AtRest(_Separator):
+    def __init__(self, study: Study, mesh: MeshControl, reference: Reference, point: Point) -> None:
+        super().__init__(study, mesh, reference, point, FINE_ALGEBRA)
+        plain = dict.fromkeys((f"{FORCED}solver", f"{FORCED}dt"))
+        self.model = self.shared.changed(**plain).changed(**self._own("time"), **self._own("model"))
+
+    def _runs(self) -> list[Setting]:
+        return [self.space]
+
+    def _pairs(self) -> list[Pair]:
+        limit = self.reference.limits["space"] if "time" in self.reference.limits else self.reference.outcome
+        return [("space", self._outcome(self.space), limit, 1.0)]
+
+
 def _separator(study: Study, mesh: MeshControl, reference: Reference, point: Point) -> _Separator:
     solver = study.problem.build(point.setting).scene.solver
+    if isinstance(solver, Quasistatic):
+        return _AtRest(study, mesh, reference, point)
     if isinstance(solver, ImplicitSolver) and "time" in reference.limits:
         return _Implicit(study, mesh, reference, point)
     return _Explicit(study, mesh, reference, point, solver)

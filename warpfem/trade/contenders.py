@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from warpfem.materials import HookeanMaterial, LinearElasticity
-from warpfem.solvers import SOLVERS, ImplicitMidpoint
+from warpfem.solvers import SOLVERS, ImplicitMidpoint, Quasistatic
 from warpfem.solvers.implicit import ImplicitSolver
 from warpfem.trade.axes import MeshControl
 from warpfem.trade.ladders import Rung
@@ -80,15 +80,36 @@ class Contenders:
     @property
     def tried(self) -> set[Setting]:
         """All settings that were tried."""
-        return self.trials.tried | self.coarse.tried
+        return self.trials.tried.keys() | self.coarse.tried.keys()
 
-    def within(self, goal: float, excluded: Collection[Setting] = ()) -> list[Trial]:
-        """The cheapest settings whose error is within a goal, but for some; from fast to slow."""
+    def within(self, goal: float, hopeless: float, excluded: Collection[Setting] = ()) -> list[Trial]:
+        """The cheapest settings that may have the error wanted over all frames, but for some; from fast to slow.
+
+        Args:
+            goal: the error, on the frames of the trials, of those that are sought.
+            hopeless: that above which none has the error wanted over all frames. What has been tried, has less, and is
+                cheaper than all that was found, is given too.
+            excluded: settings that are not given.
+        """
+        found = self._within(goal, excluded)
+        return self._cheaper(FASTER * _least(found), hopeless, excluded) + found
+
+    def _cheaper(self, seconds: float, most: float, excluded: Collection[Setting]) -> list[Trial]:
+        """What was tried and takes less time, errs by no more, and of which none is both faster and more accurate."""
+        tried = {t.setting: t for t in self.trials.tried.values() if t.seconds < seconds and t.error <= most}
+        front: list[Trial] = []
+        for trial in sorted((t for t in tried.values() if t.setting not in excluded), key=lambda t: t.seconds):
+            if not front or trial.error < front[-1].error:
+                front.append(trial)
+        return front[-CONTENDERS:]
+
+    def _within(self, goal: float, excluded: Collection[Setting]) -> list[Trial]:
+        """The cheapest settings whose error on the frames of the trials is within a goal."""
         found: list[Trial] = []
         if self.explicit:
             for base in self._by_promise([_with(EXPLICIT, element) for element in self._elements()], goal):
                 self._add(found, base, goal)
-        levels = [level for level in self._time_levels(goal, found) if level is not None]
+        levels = [level for level in (self._at_rest(goal), *self._time_levels(goal, found)) if level is not None]
         for level in sorted(levels, key=lambda t: t.seconds):
             scheme = dict(level.setting.only({name for name, _ in level.setting} - self.mesh.names))
             bases = [
@@ -172,6 +193,11 @@ class Contenders:
         growth = max(1.0, min(map(self._growth, self.points), default=1.0))
         most = min(PROMISING * _least(found) / growth, self.trials.study.limit)
         return [self._time_level(scheme, order, goal, most) for scheme, order in self._schemes().items()]
+
+    def _at_rest(self, goal: float) -> Trial | None:
+        """Equilibria in place of motion, where that makes little difference on the coarse mesh."""
+        level = self.coarse.one(self._one_step(self.coarse_mesh, Quasistatic.name))
+        return level if level.error <= SIMPLER * goal else None
 
     def _time_level(self, scheme: str, order: float, goal: float, most_seconds: float) -> Trial | None:
         share = (1.0 / order) / (1.0 / order + (self.scene.dim + 0.5) / MEAN_ORDER)

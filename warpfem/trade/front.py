@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,7 +19,7 @@ RESOLVED = 0.25
 """The largest part of an error that the reference's band may be for the error to be more than a bound."""
 
 
-TAIL = 30.0
+TAIL = 10.0
 """Errors over the smallest one of a front that belong to the part that is extrapolated."""
 
 LEAST_TAIL = 3
@@ -90,6 +90,7 @@ class Answer:
         next_seconds: time of a setting within a tenth of the error [s]; where none is within the error, of one within
             it; ``None`` if the front does not tell.
         next_how: whether that was measured or extrapolated along the front.
+        next_unknown: why the front does not tell; empty if it does.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Answer:
     closest: Candidate | None = None
     next_seconds: float | None = None
     next_how: Literal["measured", "extrapolated", ""] = ""
+    next_unknown: str = ""
 
     @property
     def sentence(self) -> str:
@@ -106,7 +108,7 @@ class Answer:
         asked = f"{percent(self.target)} of {label(self.name)}"
         if self.refusal:
             return f"No answer for {asked}: {self.refusal}"
-        price = "what that would cost, the front does not tell"
+        price = f"the front does not tell what that costs: {self.next_unknown}"
         if self.next_seconds is not None:
             price = (
                 f"{'about ' if self.next_how == 'extrapolated' else ''}{rounded(self.next_seconds)} s ({self.next_how})"
@@ -134,6 +136,8 @@ class Answer:
 def answer(ordered: Sequence[Candidate], reference: Reference, name: str, target: float) -> Answer:
     """The cheapest setting within an error.
 
+    It takes a reference that is four times as good, unless all settings are further off whatever that is.
+
     Args:
         ordered: the settings, from fast to slow.
         reference: that of their errors.
@@ -143,19 +147,19 @@ def answer(ordered: Sequence[Candidate], reference: Reference, name: str, target
     band = reference.band(name)
     if not ordered:
         return Answer(name, target, "every setting failed, or has no value of it")
-    if not band <= RESOLVED * target:
+    outside = all(own.error - own.band > target for own in ordered)
+    if not band <= RESOLVED * target and not outside:
         return Answer(name, target, f"the reference itself may be off by {percent(band)}. {advice(reference, name)}")
     edge = front(ordered)
     within = [own for own in ordered if own.bound <= target]
     goal = target / NEXT if within else target
     measured = [own for own in ordered if own.bound <= goal]
-    seconds = measured[0].seconds if measured else _extrapolated(edge, goal)
-    how: Literal["measured", "extrapolated", ""] = "measured" if measured else "extrapolated"
-    if seconds is None:
-        how = ""
+    seconds, unknown = (measured[0].seconds, "") if measured else _extrapolated(edge, goal)
+    how: Literal["measured", "extrapolated", ""] = "measured" if measured else "" if unknown else "extrapolated"
+    priced = Answer(name, target, next_seconds=seconds, next_how=how, next_unknown=unknown)
     if within:
-        return Answer(name, target, candidate=within[0], next_seconds=seconds, next_how=how)
-    return Answer(name, target, closest=min(ordered, key=lambda own: own.error), next_seconds=seconds, next_how=how)
+        return replace(priced, candidate=within[0])
+    return replace(priced, closest=min(ordered, key=lambda own: own.error))
 
 
 def advice(reference: Reference, name: str) -> str:
@@ -170,28 +174,26 @@ def advice(reference: Reference, name: str) -> str:
     )
 
 
-def _extrapolated(edge: Sequence[Candidate], goal: float) -> float | None:
-    """The time at which the front, continued as a power law from its last part, comes to an error [s].
+def _extrapolated(edge: Sequence[Candidate], goal: float) -> tuple[float | None, str]:
+    """The time at which the front, continued as a power law from its last part, comes to an error [s], or why not.
 
-    ``None`` if the front does not tell: errors that the reference does not resolve follow no power law, and where one
-    of them may be within the goal, others need not be looked for beyond. Nor does it tell where the power law would be
-    cheaper than what was measured and is not within the goal.
+    Errors that the reference does not resolve follow no power law, and where one of them may be within the goal, others
+    need not be looked for beyond. Nor does the front tell where the power law would be cheaper than what was measured
+    and is not within the goal.
     """
+    if edge[-1].error <= goal:
+        return None, f"its last setting may be within {percent(goal)}, but the reference does not resolve that"
     resolved = [own for own in edge if own.resolved]
-    if not resolved or edge[-1].error <= goal:
-        return None
-    dearest = edge[-1].seconds
-    edge = resolved
-    tail = [own for own in edge if own.error <= TAIL * edge[-1].error]
-    tail = tail if len(tail) >= LEAST_TAIL else list(edge[-LEAST_TAIL:])
+    tail = [own for own in resolved if own.error <= TAIL * resolved[-1].error]
+    tail = tail if len(tail) >= LEAST_TAIL else resolved[-LEAST_TAIL:]
     if len(tail) < 2:
-        return None
+        return None, "it has too few settings whose errors the reference resolves"
     logs = np.log([[own.error, own.seconds] for own in tail])
     slope, _ = np.polyfit(logs[:, 0], logs[:, 1], 1)
-    if slope >= 0.0:
-        return None
     seconds = math.exp(logs[-1, 1] + slope * (math.log(goal) - logs[-1, 0]))
-    return seconds if seconds > dearest else None
+    if not seconds > edge[-1].seconds:
+        return None, f"continued, it would be cheaper than its last setting, which is not within {percent(goal)}"
+    return seconds, ""
 
 
 def percent(value: float) -> str:

@@ -42,7 +42,7 @@ def measure(order: Order) -> Outcome:
 def _measure(order: Order, outcome: Outcome) -> None:
     problem = order.problem
     outcome.by_chance = True
-    problem.require_same_file()
+    problem.require_same_files()
     outcome.by_chance = False  # what fails from here on fails again
     choice = problem.build(order.setting)
     threads = order.threads or available_threads()

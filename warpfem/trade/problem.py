@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import warp
 
-from warpfem import __version__
 from warpfem.boundary import PointForce
 from warpfem.dtypes import FloatName
 from warpfem.errors import SceneError
@@ -79,7 +78,7 @@ class Setting:
         """The setting for people, as one would write it on the command line."""
         return " ".join(f"{name}={value}" for name, value in self.values) or "as written"
 
-    @cached_property
+    @functools.cached_property
     def canonical(self) -> str:
         """The same for two settings that differ in their order alone."""
         return json.dumps(sorted(self.values))
@@ -108,6 +107,8 @@ class Problem:
         frames: frames to simulate; ``None`` as the scene says.
         device: Warp device; ``None`` takes Warp's default.
         digest: that of the file and what it imports; a worker elsewhere may have another file of that name.
+        code: likewise, of this package.
+        files: those of other programs that the scene as written reads, such as meshes, and their digests.
     """
 
     path: str
@@ -115,6 +116,8 @@ class Problem:
     frames: int | None = None
     device: str | None = None
     digest: str = ""
+    code: str = ""
+    files: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def of(
@@ -130,18 +133,26 @@ class Problem:
         Raises:
             SceneError: there is no such file.
         """
-        return cls(str(Path(path).absolute()), tuple((parameters or {}).items()), frames, device, source_digest(path))
+        given = tuple((parameters or {}).items())
+        return cls(str(Path(path).absolute()), given, frames, device, source_digest(path), code_digest())
+
+    def reading(self, files: Iterable[Path]) -> Problem:
+        """The same problem, with the files of other programs that its scene reads."""
+        return replace(self, files=tuple((str(file), source_digest(file)) for file in sorted(files)))
 
     def key(self, setting: Setting) -> str:
-        """Names the results of a setting: the same file, parameters, setting and versions give the same."""
-        versions = [__version__, warp.__version__]
-        parts = [self.digest, sorted(self.parameters), self.frames, self.device, setting.canonical, versions]
+        """Names the results of a setting: the same files, parameters, setting and code give the same."""
+        code = [self.code, warp.__version__]
+        parts = [self.digest, self.files, sorted(self.parameters), self.frames, self.device, setting.canonical, code]
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:20]
 
-    def require_same_file(self) -> None:
-        """Raises SceneError if the file is not there, or another one."""
-        if source_digest(self.path) != self.digest:
-            raise SceneError(f"{self.path} is not the file that the study was begun with")
+    def require_same_files(self) -> None:
+        """Raises SceneError if the scene's file, or one that it reads, is not there or another one; or warpfem is."""
+        for path, digest in ((self.path, self.digest), *self.files):
+            if source_digest(path) != digest:
+                raise SceneError(f"{path} is not the file that the study was begun with")
+        if code_digest() != self.code:
+            raise SceneError("this is not the code of warpfem that the study was begun with")
 
     def parameter_names(self) -> list[str]:
         """The parameters of the file's function ``scene``."""
@@ -185,6 +196,18 @@ class Problem:
         scene = self.build(setting.changed(**dict.fromkeys(asked))).scene
         lacking = [name for name in asked if name not in {field.name for field in fields(scene.solver)}]  # type: ignore[arg-type]
         return setting.changed(**dict.fromkeys(lacking))
+
+
+@functools.cache
+def code_digest() -> str:
+    """Names the code of this package, which a version does not while it is worked on."""
+    package = Path(__file__).parent.parent
+    digest = hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        digest.update(
+            f"{file.relative_to(package).as_posix()} {hashlib.sha256(file.read_bytes()).hexdigest()}".encode()
+        )
+    return digest.hexdigest()
 
 
 def known_names(parameters: Sequence[str]) -> list[str]:

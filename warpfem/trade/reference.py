@@ -33,8 +33,13 @@ COARSE_TOLERANCE = "1e-6"
 L2, LARGEST = "l2", "max"
 """The two norms over the trajectory, among the names of what errors are measured of."""
 
-MOST_LEVELS = 6
+MOST_LEVELS = 9
 """Levels of a ladder beyond which a finer one is not the answer."""
+
+DEFAULT_STIFFNESS = (
+    "the stiffness of obstacles, where the scene gives none, goes with the size of the cells: bodies sink in less on "
+    "finer meshes, and the motion changes by that, too"
+)
 
 LEAST_CHANGE = 0.95
 """Part of the mesh size down to which a mesh has to go to be a finer one."""
@@ -129,6 +134,8 @@ class _Builder:
 
     def build(self, name: str, least: float, within: float | None) -> Reference:
         self._begin()
+        if any(obstacle.stiffness is None for obstacle in self.study.scene.obstacles):
+            self.remarks.append(DEFAULT_STIFFNESS)
         while True:
             reference, cross = self._reference()
             parts = reference.parts.get(name)
@@ -219,12 +226,9 @@ class _Builder:
             return False
         last = self.study.solve(self._space()[-1:])[0].first
         why = "its meshes do not get finer"
-        for factor in (2.0, 1.5):
-            finer = self.mesh.finer(self.meshes[-1], factor)
+        for finer, factor in self._next_meshes():
             if not self._affordable(factor ** (self.study.scene.dim + 1) * last.seconds[0]):
                 why = f"a reference with a finer mesh would take more than {self.study.limit:g} s"
-                continue
-            if finer is None:
                 continue
             (point,) = self.study.solve([self._timed(finer, self.steps[self.shared])])
             if point.failure:
@@ -235,6 +239,21 @@ class _Builder:
                 return True
         self.remarks.append(why)
         return False
+
+    def _next_meshes(self) -> list[tuple[Setting, float]]:
+        """What may follow the last mesh, and by how much it is finer.
+
+        The first three are finer by 2 each, the others by 1.5 and 4/3 in turn, so that each is finer by 2 than the last
+        but one: of many kinds of meshes those of even numbers of cells have more in common than with odd ones.
+        """
+        last, before = self.meshes[-1], self.meshes[-2:-1]
+        doubled, between = self.mesh.finer(last, 2.0), self.mesh.finer(last, 1.5)
+        found = [(between, 2.0 if between == doubled else 1.5)]
+        if len(self.meshes) < 3:
+            found.insert(0, (doubled, 2.0))
+        elif (own := self.mesh.finer(before[0], 2.0)) != last:
+            found.insert(0, (own, 4.0 / 3.0))
+        return [(finer, factor) for finer, factor in found if finer is not None and finer not in self.meshes]
 
     def _grow_steps(self) -> bool:
         """Adds shorter steps; false if that is not to be had."""

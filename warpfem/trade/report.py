@@ -12,6 +12,7 @@ from typing import Any
 
 from warpfem.errors import OutputError
 from warpfem.files import replacing
+from warpfem.trade.extrapolation import order_text
 from warpfem.trade.front import Answer, Candidate, label, percent
 from warpfem.trade.machine import facts
 from warpfem.trade.reference import Reference
@@ -71,7 +72,7 @@ def reference_lines(reference: Reference, name: str) -> list[str]:
     lines = [f"reference, for {label(name)}: off by {percent(reference.band(name))} at most, by its own estimate"]
     for kind, part in reference.parts[name].items():
         rungs = reference.ladders.get(kind, [])
-        order = f"observed order {part.order:.2f}" if part.order is not None else part.remark
+        order = f"observed order {order_text(part.order)}" if part.order is not None else part.remark
         levels = f"{len(rungs)} levels" if rungs else "a tolerance 100 times as large"
         lines.append(f"  {kind}: ± {percent(part.band)}, {levels}" + (f", {order}" if order else ""))
     lines += [f"  {remark}" for remark in dict.fromkeys(reference.remarks)]
@@ -196,6 +197,7 @@ def _answer_data(own: Answer) -> dict[str, Any]:
         "refusal": own.refusal,
         "next_seconds": own.next_seconds,
         "next_how": own.next_how,
+        "next_unknown": own.next_unknown,
         "sentence": own.sentence,
     }
 

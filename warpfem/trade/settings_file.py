@@ -21,7 +21,8 @@ TABLES = ("parameters", "changes")
 NOTES = ("estimate", "reference", "machine")
 """What a file has: two texts, two tables that are used, and tables that only tell."""
 
-_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?(e[+-]?\d+)?", re.ASCII)
+_NUMBER = re.compile(r"-?(0|[1-9]\d{0,17})(\.\d+)?(e[+-]?\d+)?", re.ASCII)
+"""Numbers of JSON and of TOML, whose integers have 64 bits."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +146,8 @@ def _text(path: Path, name: str, value: object) -> str:
 
 
 def _plain(text: str) -> str:
-    """A number as it is, any other text in quotes."""
-    return text if _NUMBER.fullmatch(text) else _toml(text)
+    """A number that is read as it was written as it is, any other text in quotes."""
+    return text if _NUMBER.fullmatch(text) and str(json.loads(text)) == text else _toml(text)
 
 
 def _key(name: str) -> str:

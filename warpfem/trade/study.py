@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from warpfem.child import noting_files
 from warpfem.errors import OutputError, described
 from warpfem.places import spread_places
 from warpfem.trade.machine import facts
@@ -19,7 +20,10 @@ from warpfem.trade.process import run_order
 from warpfem.trade.store import Store
 
 PLACES = 400
-"""Places at which motions are compared, over all bodies."""
+"""Places at which motions are compared, over all bodies, each standing for the same volume."""
+
+FEWEST_PLACES = 10
+"""Places of a body that is a small part of the volume."""
 
 ROUNDS = 5
 """Runs in one process of a setting whose runs are short."""
@@ -106,7 +110,6 @@ class Study:
         threads: int | None = None,
         say: Say = lambda text: None,
     ) -> None:
-        self.problem = problem
         self.store = store
         self.load = load
         self.limit = limit
@@ -115,12 +118,15 @@ class Study:
         self._executor = executor
         self._machine = facts()
         self._given_up: set[Setting] = set()
-        self.scene = problem.build(Setting()).scene
-        self.places = store.places(problem, self._spread)
+        with noting_files() as files:
+            self.scene = problem.build(Setting()).scene
+        self.problem = problem.reading(files)
+        self.places = store.places(self.problem, self._spread)
 
     def _spread(self) -> list[np.ndarray]:
-        share = max(1, PLACES // len(self.scene.bodies))
-        return [spread_places(body.mesh, share) for body in self.scene.bodies]
+        volumes = np.array([body.mesh.cell_volumes.sum() for body in self.scene.bodies])
+        counts = np.maximum(FEWEST_PLACES, np.rint(PLACES * volumes / volumes.sum()).astype(int))
+        return [spread_places(body.mesh, count) for body, count in zip(self.scene.bodies, counts, strict=True)]
 
     def shortened(self, frames: int) -> Study:
         """The same study of the first frames alone."""

@@ -79,15 +79,16 @@ class Trials:
         self.reference = reference
         self.scales = scales
         self.name = name
-        self.tried: set[Setting] = set()
+        self.tried: dict[Setting, Trial] = {}
 
     def run(self, settings: Sequence[Setting]) -> list[Trial]:
         """Tries settings; what float32 does not resolve, in float64."""
-        self.tried |= set(settings)
         points = self.study.run(settings)
         again = {p.setting: p.setting.changed(dtype="float64") for p in points if _asks_for_digits(p)}
         wider = dict(zip(again, self.study.run(list(again.values())), strict=True))
-        return [self._trial(wider.get(point.setting, point)) for point in points]
+        trials = [self._trial(wider.get(point.setting, point)) for point in points]
+        self.tried |= dict(zip(settings, trials, strict=True))
+        return trials
 
     def one(self, setting: Setting) -> Trial:
         """Tries a setting."""
@@ -122,7 +123,8 @@ def coarsest_within(
 ) -> Trial | None:
     """The coarsest level of a sequence of settings whose error is within a goal, or one little finer.
 
-    Levels are guessed from E ~ resolution^-p, with p from the two levels next to the goal.
+    Levels are guessed from E ~ resolution^-p, with p from the two levels next to the goal. Where errors no longer fall,
+    the search goes on in float64 if that helps.
 
     Args:
         run: tries a setting.
@@ -136,6 +138,7 @@ def coarsest_within(
     """
     tried: list[Trial] = []
     following: Setting | None = start
+    rounded = math.inf  # the error that no refinement has brought down in float32
     while following is not None and following not in {t.setting for t in tried} and len(tried) < MOST_TRIALS:
         trial = run(following)
         tried.append(replace(trial, setting=following))
@@ -145,8 +148,13 @@ def coarsest_within(
                 following = finer(following, 2.0) if len(tried) < 3 else None
                 continue
             factor = _step(tried, resolution, goal, order)
-            if trial.seconds * factor**growth > most_seconds or _stagnates(tried):
+            if trial.seconds * factor**growth > most_seconds or trial.error > STAGNANT * rounded:
                 return None
+            if _stagnates(tried):
+                if "dtype" in following:
+                    return None
+                following, tried, rounded = following.changed(dtype="float64"), [], trial.error
+                continue
             following = next(filter(None, (finer(following, own) for own in (factor, *LARGER) if own >= factor)), None)
             continue
         best = min(good, key=resolution)

@@ -2,12 +2,14 @@
 
 1. A reference is built whose error band is a part of the error asked for, or the search is refused.
 2. On the first part of the frames the settings are sought that may be the cheapest (:mod:`warpfem.trade.contenders`).
-3. These are run to the end. The frames that the search has not seen show whether they hold; if they do not, or are far
-   more accurate than asked, the search is repeated for a smaller or larger error.
+3. These are run to the end, and what is cheaper and may be within the error over all frames. The frames that the search
+   has not seen show whether they hold; if they do not, or are far more accurate than asked, the search is repeated for
+   a smaller or larger error.
 4. Of the one that is left the tolerance is loosened, as far as that makes it faster and its error allows it.
 
-Linear elasticity takes the place of another law only where the difference that it makes on a coarse mesh is a small
-part of the error asked for, and where it is faster. Other models, such as plane strain, are a scene's own to offer.
+Linear elasticity takes the place of another law, and equilibria that of motion, only where the difference that this
+makes on a coarse mesh is a small part of the error asked for, and where it is faster. Other models, such as plane
+strain, are a scene's own to offer.
 """
 
 from __future__ import annotations
@@ -44,8 +46,8 @@ FEWEST_FRAMES = 8
 SEARCHES = 4
 """How often the search is repeated for another error."""
 
-MOST_RELAXED = 3.0
-"""By how much the error of a search grows at most."""
+CLOSE_CALL = 1.5
+"""Times the cost of the cheapest up to which settings are timed again before one is chosen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +117,15 @@ def tune(study: Study, mesh: MeshControl, name: str, target: float, *, repeats: 
     )
     whole = Trials(study, reference.outcome, reference.scales, name)
     limit = _limit(name, target, reference.band(name))
-    holding, ended = _search(contenders, whole, limit, frames)
+    # all of a mean square can be in the frames that are seen
+    hopeless = limit * math.sqrt((total + 1) / (frames + 1)) if name == L2 else limit
+    holding, ended = _search(contenders, whole, limit, hopeless, frames)
     if not holding:
         raise SimulationError(
             f"no setting within {percent(target)} of {label(name)} was found in runs of up to {study.limit:g} s"
             + "".join(f"; {trial.setting.label} is off by {percent(trial.error)}" for trial in ended)
         )
-    winner = min(holding, key=lambda trial: trial.seconds)
-    winner = _loosened(winner, whole, limit)
+    winner = _loosened(_fastest(holding, study.alone(), repeats), whole, limit)
     (point,) = study.alone().run([winner.setting], repeats)
     seen = unseen = None
     if divided:
@@ -132,8 +135,6 @@ def tune(study: Study, mesh: MeshControl, name: str, target: float, *, repeats: 
         )
     (parts,) = components(study, mesh, reference, [point])
     errors = {kind: own[name] for kind, own in parts.items() if name in own}
-    if f"{FORCED}material" in winner.setting:
-        errors["model"] = contenders.linear_error
     return Tuned(
         name,
         target,
@@ -146,7 +147,7 @@ def tune(study: Study, mesh: MeshControl, name: str, target: float, *, repeats: 
         reference,
         errors,
         sorted(ended, key=lambda trial: trial.seconds),
-        len(contenders.tried | whole.tried),
+        len(contenders.tried | whole.tried.keys()),
     )
 
 
@@ -164,15 +165,20 @@ def _part(outcome: Outcome, frames: slice) -> Outcome:
     return replace(outcome, times=outcome.times[frames], motion=outcome.motion[frames])
 
 
-def _search(contenders: Contenders, whole: Trials, limit: float, frames: int) -> tuple[list[Trial], list[Trial]]:
-    """Settings whose error over all frames is within a limit, and all that were run over all."""
+def _search(
+    contenders: Contenders, whole: Trials, limit: float, hopeless: float, frames: int
+) -> tuple[list[Trial], list[Trial]]:
+    """Settings whose error over all frames is within a limit, and all that were run over all.
+
+    On the first frames, none has an error above ``hopeless`` that is within the limit over all.
+    """
     goal = SAFE * limit
     ended: dict[Setting, Trial] = {}
     holding: list[Trial] = []
     for _ in range(SEARCHES):
         whole.study.say(f"settings within {percent(goal)} on the first {frames} frames")
         failed = {trial.setting for trial in ended.values() if trial.point.failure}
-        found = [trial for trial in contenders.within(goal, failed) if trial.setting not in ended]
+        found = [trial for trial in contenders.within(goal, hopeless, failed) if trial.setting not in ended]
         if not found:
             break
         last = whole.run([trial.setting for trial in found])
@@ -191,11 +197,20 @@ def _search(contenders: Contenders, whole: Trials, limit: float, frames: int) ->
             goal = min(just.values(), default=goal)
             continue
         best = min(holding, key=lambda trial: trial.seconds)
-        relaxed = min(just.get(best.setting, 0.0), MOST_RELAXED * goal)
+        relaxed = min(just.get(best.setting, 0.0), hopeless)
         if best.error >= SLACK * limit or relaxed <= goal:
             break
         goal = relaxed
     return holding, list(ended.values())
+
+
+def _fastest(holding: list[Trial], study: Study, repeats: int) -> Trial:
+    """The fastest, by times of which none was disturbed by chance."""
+    least = min(trial.seconds for trial in holding)
+    close = [trial for trial in holding if trial.seconds <= CLOSE_CALL * least]
+    points = study.run([trial.setting for trial in close], repeats)
+    timed = [replace(trial, point=point) for trial, point in zip(close, points, strict=True)]
+    return min(timed, key=lambda trial: trial.seconds)
 
 
 def _loosened(winner: Trial, whole: Trials, limit: float) -> Trial:
