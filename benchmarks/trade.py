@@ -40,11 +40,16 @@ class Study:
     about: str
     options: tuple[str, ...] = ()
 
+    @property
+    def scene(self) -> str:
+        """The scene file, from the project's folder."""
+        return f"scenes/{self.name}.py"
+
     def command(self) -> list[str]:
         """The arguments of ``warpfem``, without the folder."""
         axes = [part for axis in self.axes for part in ("--axis", axis)]
         errors = [part for error in ERRORS for part in ("--error", error)]
-        return ["trade", f"scenes/{self.name}.py", *axes, *errors, "--quantity", self.quantity, *self.options]
+        return ["trade", self.scene, *axes, *errors, "--quantity", self.quantity, *self.options]
 
 
 STUDIES = (
@@ -91,8 +96,10 @@ def main() -> None:
                 sys.exit(done.returncode)
             if not (own / "trade.png").exists():
                 sys.exit(f"{study.name}: the study has no plot: without a reference, or without the extra 'plot'")
-            for name in ("trade.json", "trade.csv", "trade.png"):
+            for name in ("trade.csv", "trade.png"):
                 shutil.copy(own / name, plots / f"{study.name}{Path(name).suffix}")
+            result = json.loads((own / "trade.json").read_text()) | {"scene": study.scene}  # wherever it lies here
+            (plots / f"{study.name}.json").write_text(json.dumps(result, indent=2) + "\n")
     results = {s.name: json.loads(path.read_text()) for s in STUDIES if (path := plots / f"{s.name}.json").exists()}
     options.out.write_text(page(results, plots.name))
 
