@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +28,7 @@ from launches import Launches, launches_of, recorded
 
 import warpfem as wf
 import warpfem.model
-from warpfem.linear import BlockJacobi, ConjugateGradients, tangent_operator
+from warpfem.linear import BlockJacobi, ConjugateGradients, cell_sums, operators, tangent_operator
 from warpfem.scene_file import load_scene
 
 ARCHITECTURES = (80, 90)
@@ -103,9 +104,15 @@ def kernels_of(scene: wf.Scene) -> list[wp.Kernel]:
     return [kernel for kernel in kernels if kernel.module.name not in ON_THE_CPU_ALONE]
 
 
-def as_on_cuda() -> contextlib.AbstractContextManager:
-    """A context in which models on the CPU use the kernels that they use on CUDA: one cell to a task."""
-    return mock.patch.object(warpfem.model.CellBlock, "vectorize")
+@contextlib.contextmanager
+def as_on_cuda() -> Iterator[None]:
+    """A context in which models on the CPU use the kernels that they use on CUDA: one cell or row to a task."""
+    with (
+        mock.patch.object(warpfem.model.CellBlock, "vectorize"),
+        mock.patch.object(operators, "SLICED_POINTS", sys.maxsize),
+        mock.patch.object(cell_sums, "GROUP_BLOCKS", sys.maxsize),
+    ):
+        yield
 
 
 def compile_module(module: wp.Module, architecture: int, folder: str | Path) -> str:
@@ -221,7 +228,8 @@ def explicit_step(cells: int) -> Work:
 def conjugate_gradient_iteration(cells: int) -> Work:
     """One iteration of conjugate gradients on the assembled stiffness, with block Jacobi."""
     model = wf.Model(block_scene(cells, wf.BackwardEuler()), device="cpu")
-    operator = tangent_operator(model, "assembled")
+    with as_on_cuda():
+        operator = tangent_operator(model, "assembled")
     operator.linearize(model.state().u, mass_weight=1e4, precondition=True)
     solver, preconditioner, x = ConjugateGradients(model), BlockJacobi(operator), model.zeros()
 

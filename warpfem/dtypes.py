@@ -71,3 +71,11 @@ def uniform_array(value: Any, count: int, dtype: type, device: Any) -> wp.array:
     view = wp.array(ptr=stored.ptr, dtype=dtype, shape=(count,), strides=(0,), device=device)
     view._stored = stored  # keeps the memory alive as long as the view
     return view
+
+
+def part_of(array: wp.array, part: slice) -> wp.array:
+    """A part of an array, which may be a :func:`uniform_array`."""
+    view = array[part]
+    if hasattr(array, "_stored"):
+        view._stored = array._stored
+    return view

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpfem.boundary import PointForce, Traction
-from warpfem.dtypes import FloatName, types, uniform_array
+from warpfem.dtypes import FloatName, part_of, types, uniform_array
 from warpfem.elements import ElementKernels, element_kernels
 from warpfem.errors import SceneError, SimulationError
 from warpfem.launches import Launcher, Total
@@ -267,7 +267,7 @@ class CellBlock:
         places = self.shape.quadrature_count
         inner = slice(part.start * places, part.stop * places)
         by_cell = ("cells", "parameters")
-        return {name: array[part if name in by_cell else inner] for name, array in self.arguments.items()}
+        return {name: part_of(array, part if name in by_cell else inner) for name, array in self.arguments.items()}
 
     def per_cell(self, values: np.ndarray) -> np.ndarray:
         """Values of the quadrature points (k, ...) as an array (count, q, ...)."""

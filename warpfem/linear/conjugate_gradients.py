@@ -269,7 +269,7 @@ def _kernels(dim: int, dtype: str, on_cpu: bool) -> SimpleNamespace:
     """
     t = types(dim, dtype)
     vector, matrix, scalar = t.vector, t.matrix, t.scalar
-    module = f"warpfem.conjugate_gradients_{dim}_{dtype}"
+    module = f"warpfem.conjugate_gradients_{dim}_{dtype}{'' if on_cpu else '_gpu'}"
     span = CHUNK if on_cpu else 1
 
     functions = entry_functions(dim, dtype)

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warpfem.dtypes import uniform_array
+from warpfem.dtypes import part_of, uniform_array
 from warpfem.errors import SimulationError
 from warpfem.launches import Recordings, jobs
 from warpfem.linear import tangent_operator
@@ -126,7 +126,7 @@ class Watch:
                 launches[thread].append(
                     block.launch(
                         "frequency",
-                        [density[part], u],
+                        [part_of(density, part), u],
                         [self._squares[thread : thread + 1]],
                         part=part,
                         kernels=block.bounding_kernels,
