@@ -21,6 +21,7 @@ LAYERS = [
         "threads",
         "strips",
         "subnormals",
+        "vector_code",
     },
     {"mesh", "points", "launches", "quantities", "log_file"},
     {"materials"},

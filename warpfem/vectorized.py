@@ -12,7 +12,6 @@ the length to negative indices, and adding 0 needs no test) with strides that ar
 """
 
 import functools
-import platform
 
 import numpy as np
 import warp as wp
@@ -24,6 +23,7 @@ from warpfem.materials.base import Constitutive
 from warpfem.strips import STRIP, cut_into_strips
 from warpfem.tensor import select
 from warpfem.threads import Job, Team, share
+from warpfem.vector_code import compiler_flags
 
 CHUNK = 64
 """Strips of one task: their forces (4.6 kB in single precision) fit the first-level cache with all else."""
@@ -33,14 +33,6 @@ LANES = 8
 
 WINDOW = 512
 """Points among which those of equal numbers of strips are brought together, so that lanes are not idle."""
-
-
-def _compiler_flags(depth: int) -> str:
-    """Warp's own flags with fused multiply-adds, the widest registers, and a depth for straight-line vector code."""
-    flags = "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
-    if platform.machine() in ("x86_64", "AMD64"):
-        flags += " -mprefer-vector-width=512"
-    return f"{flags} -mllvm=-slp-recursion-max-depth={depth}"
 
 
 class _Readers:
@@ -95,7 +87,7 @@ def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: boo
     read = _Readers(constitutive.parameter_count, dim, dtype, uniform)
     read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": _compiler_flags(4)})
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiler_flags(4)})
     def strip_force(
         first: int,
         strip_points: wp.array(dtype=wp.int32),
@@ -205,7 +197,7 @@ def _sum_kernel(dim: int, dtype: str) -> wp.Kernel:
     scalar, vector = t.scalar, t.vector
     rows = wp.types.matrix(shape=(dim, LANES), dtype=scalar)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": _compiler_flags(12)})
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiler_flags(12)})
     def sum_strip_forces(
         first: int,
         entry_starts: wp.array(dtype=wp.int32),

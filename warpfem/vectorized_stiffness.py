@@ -6,7 +6,6 @@ each cell is computed before, in a pass of its own, as the forces have it.
 """
 
 import functools
-import platform
 
 import warp as wp
 
@@ -15,15 +14,11 @@ from warpfem.materials.base import Constitutive
 from warpfem.model import CellBlock
 from warpfem.stiffness import CHUNK, pair_count
 from warpfem.tensor import deformation_gradient, direct_rotation, polar_rotation
+from warpfem.vector_code import compiler_flags
 
-_FLAGS = (
-    "-march=native -ffp-contract=fast -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
-    + (" -mprefer-vector-width=512" if platform.machine() in ("x86_64", "AMD64") else "")
-    # the results of a loop are more than the uses by which LLVM, as shipped, can tell that they do not alias its
-    # inputs, and a block has more entries than the members it would interleave
-    + " -mllvm=-capture-tracking-max-uses-to-explore=10000 -mllvm=-max-interleave-group-factor=16"
-    + " -mllvm=-slp-recursion-max-depth=4"
-)
+# The results of a loop are more than the uses by which LLVM, as shipped, can tell that they do not alias its inputs,
+# and a block has more entries than the members that it would interleave.
+_FLAGS = compiler_flags(4, "capture-tracking-max-uses-to-explore=10000", "max-interleave-group-factor=16")
 
 
 def can_vectorize(block: CellBlock) -> bool:
