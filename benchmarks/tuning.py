@@ -217,8 +217,8 @@ def page(records: dict[str, dict]) -> str:
             "cells; a star where that run is in tuning's reference, too. Beside it is the best of a sweep of all "
             "combinations of four meshes, two kinds of cells, and seven schemes and steps: the fastest whose true "
             "error is within what is asked for. Both are timed in turn, and times are the median of some processes, of "
-            "the steps alone. Runs of the sweep that take longer than twice as long and 6 s more are ended: where none is "
-            "left that is within the error, what was found is cheaper than all."
+            "the steps alone. Runs of the sweep that take longer than twice as long and 6 s more are ended: where "
+            "none is left that is within the error, what was found is cheaper than all."
         ),
         f"**{summary}**",
         "",
