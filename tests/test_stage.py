@@ -240,10 +240,10 @@ def test_studies_take_stages(tmp_path: Path) -> None:
     problem = Problem.of(path, frames=7)
     scene = problem.build(Setting.of(dt="1/60", element="P2")).scene
     assert (scene.dt, scene.frames, scene.bodies[0].mesh.order) == (pytest.approx(1 / 60), 7, 2)
-    problem.require_same_file()
+    problem.require_same_files()
     write(tmp_path / "material.usda", MATERIAL.replace("1e5", "2e5"))
     with pytest.raises(wf.SceneError, match="not the file that the study was begun with"):
-        problem.require_same_file()
+        problem.require_same_files()
 
 
 def test_bodies_fall_as_galileo_says(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from warpfem.solvers.implicit import ImplicitSolver
 E, NU, DENSITY = 1e6, 0.3, 1000.0
 DT, DURATION = 0.01, 1.0
 IMPLICIT = {name: solver(tolerance=1e-8) for name, solver in wf.SOLVERS.items() if issubclass(solver, ImplicitSolver)}
-EXPLICIT = {name: solver() for name, solver in wf.SOLVERS.items() if name not in IMPLICIT}
+EXPLICIT = {name: solver() for name, solver in wf.SOLVERS.items() if name not in {*IMPLICIT, wf.Quasistatic.name}}
 SOLVERS = {**IMPLICIT, "linearised backward Euler": wf.BackwardEuler.linearised(), **EXPLICIT}
 KEEPING = {"implicit_midpoint": 1e-6, "symplectic_euler": 1e-11, "velocity_verlet": 1e-11}
 """The largest change of the angular momentum of the solvers that keep it, up to rounding or their tolerance."""
