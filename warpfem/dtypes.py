@@ -31,6 +31,11 @@ class Types:
     numpy: type
 
     @property
+    def name(self) -> FloatName:
+        """The precision by its name."""
+        return "float32" if self.scalar is wp.float32 else "float64"
+
+    @property
     def epsilon(self) -> float:
         """Distance from 1 to the next larger number."""
         return float(np.finfo(self.numpy).eps)

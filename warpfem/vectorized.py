@@ -260,7 +260,7 @@ class VectorizedForce:
         self._recordings = Recordings()
         t = kernels.types
         dim = self.dim = kernels.dim
-        dtype = "float32" if t.scalar is wp.float32 else "float64"
+        dtype = t.name
         uniform = len(parameters) == 1
         made_for = (kernels.constitutive, dim, dtype, uniform)
         self._kernels = [_force_kernel(*made_for)]

@@ -243,7 +243,7 @@ class VectorizedStiffness:
     def __init__(self, block: CellBlock, most_cells: int, threads: int) -> None:
         self._block = block
         kernels = block.kernels
-        dtype = "float32" if kernels.types.scalar is wp.float32 else "float64"
+        dtype = kernels.types.name
         uniform = block.arguments["parameters"].strides[0] == 0
         self._corners = kernels.dim + 1
         self._columns = _column_kernel(kernels.constitutive, kernels.dim, dtype, uniform)

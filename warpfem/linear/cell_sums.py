@@ -83,7 +83,7 @@ class CellSums:
     def _record(self, kernel: str, u: wp.array, sums_out: wp.array) -> list[Job]:
         block = self._block
         t = block.kernels.types
-        add_up = assembly_kernels(t.dim, "float32" if t.scalar is wp.float32 else "float64").add_up_cells
+        add_up = assembly_kernels(t.dim, t.name).add_up_cells
         launches: list[list[wp.Launch | None]] = []
         parts = share(len(self._groups), len(self._entries))
         for thread, (part, entries) in enumerate(zip(parts, self._entries, strict=True)):
