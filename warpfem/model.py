@@ -212,9 +212,9 @@ class CellBlock:
         """Prepares the force of several cells at a time, where that is possible and there are ``least`` cells."""
         constitutive = self.kernels.constitutive
         # a GPU has lanes of its own, and adds to points by atomics, which it does well
-        possible = self.device.is_cpu and self.shape.order == 1 and not self.averaged
+        possible = self.device.is_cpu and not self.averaged
         possible = possible and (constitutive.branchless or constitutive.direct_stress is not None)
-        if self.vectorized or not possible or self.count < least:
+        if self.vectorized or not possible or len(self.arguments["volume"]) < least:
             return
         from warpfem.vectorized import VectorizedForce
 

@@ -37,12 +37,17 @@ def cut_into_strips(points: np.ndarray, cells: np.ndarray) -> Strips:
         points: (point_count, dim) [m].
         cells: (cell_count, dim + 1) int.
     """
-    axes = _numbering_axes(points)
-    order = np.argsort(_space_filling_keys(points[cells].mean(axis=1)[:, axes]), kind="stable")
+    order = order_in_space(points, cells)
     chains = _chains(_neighbours(cells[order]))
     found = chains >= 0
     chains = np.where(found, order[chains], -1)
     return Strips(_numbered(cells, chains, found.sum(axis=1)), chains)
+
+
+def order_in_space(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """The cells (count,) along a space-filling curve that divides the body as its points' numbers do first of all."""
+    keys = _space_filling_keys(points[cells].mean(axis=1)[:, _numbering_axes(points)])
+    return np.argsort(keys, kind="stable")
 
 
 def _numbering_axes(points: np.ndarray) -> np.ndarray:

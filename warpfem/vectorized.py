@@ -1,9 +1,10 @@
-"""Internal forces of linear cells on the CPU, several cells at a time in vector registers.
+"""Internal forces of cells on the CPU, several cells at a time in vector registers.
 
-One task takes a chunk of strips (see ``strips.py``) in a loop over unit-stride data with the strips in the innermost
-place, which the compiler turns into vector code of the width that the processor has. The forces on the points of the
-strips go to an array of their own; a second kernel sums them for each point through an index list, always in the same
-order: without atomics, with the same bits however the tasks are divided among threads.
+One task takes a chunk of rows in a loop over unit-stride data with the rows in the innermost place, which the compiler
+turns into vector code of the width that the processor has. A row is a strip of linear cells (see ``strips.py``) or one
+quadratic cell: points, and some quadrature points whose deformation gradients depend on those. The forces on the points
+of the rows go to an array of their own; a second kernel sums them for each point through an index list, always in the
+same order: without atomics, with the same bits however the tasks are divided among threads.
 
 What lets the compiler do it: the material's stress has no branches (``Constitutive.branchless``), or one without them
 that tells where it holds (``direct_stress``; the remaining cells are then taken one at a time); results are kept on
@@ -20,33 +21,64 @@ from warpfem.dtypes import types
 from warpfem.elements import ElementKernels
 from warpfem.launches import Recordings, jobs
 from warpfem.materials.base import Constitutive
-from warpfem.strips import STRIP, cut_into_strips
+from warpfem.shapes import Shape
+from warpfem.strips import STRIP, cut_into_strips, order_in_space
 from warpfem.tensor import select
 from warpfem.threads import Job, Team, share
 from warpfem.vector_code import compiler_flags
 
 CHUNK = 64
-"""Strips of one task: their forces (4.6 kB in single precision) fit the first-level cache with all else."""
+"""Rows of one task: their forces (4.6 kB of strips, in single precision) fit the first-level cache with all else."""
 
 LANES = 8
 """Points that are summed at a time."""
 
 WINDOW = 512
-"""Points among which those of equal numbers of strips are brought together, so that lanes are not idle."""
+"""Points among which those of equal numbers of rows are brought together, so that lanes are not idle."""
+
+
+class _Row:
+    """What a row of cells of a shape is.
+
+    At a quadrature point of barycentric coordinates lambda, which the cells' corners after the first have, the
+    displacements u_n of its points change with lambda_a by the sum of w_n u_n over some of them.
+
+    Attributes:
+        width: points.
+        places: quadrature points.
+        terms: of each of these sums.
+        points: (places, dim, terms) int, its n.
+        weights: (places, dim, terms) float, its w.
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        dim = shape.dim
+        if shape.order == 1:
+            self.width, self.places = STRIP + dim, STRIP
+            first = np.arange(STRIP)[:, None]
+            self.points = np.stack([*np.broadcast_arrays(first + 1 + np.arange(dim), first)], axis=2)
+            self.weights = np.broadcast_to([1.0, -1.0], self.points.shape)
+        else:
+            self.width, self.places = shape.point_count, shape.quadrature_count
+            directions = shape.quadrature_gradients.transpose(0, 2, 1)
+            used = directions.any(axis=0)
+            self.points = np.broadcast_to([np.flatnonzero(own) for own in used], (self.places, dim, used[0].sum()))
+            self.weights = np.take_along_axis(directions, self.points, axis=2)
+        self.terms = self.points.shape[2]
 
 
 class _Readers:
-    """Kernel functions that read what a cell of a strip has, from blocked arrays."""
+    """Kernel functions that read what a row has from blocked arrays."""
 
-    def __init__(self, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
+    def __init__(self, row: _Row, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
         t = types(dim, dtype)
         scalar, vector, matrix = t.scalar, t.vector, t.matrix
         parameter_vector = wp.types.vector(length=parameter_count, dtype=scalar)
-        width = STRIP + dim
+        width = row.width
 
         @wp.func
         def displacement(points: wp.array(dtype=wp.int32), u: wp.array(dtype=scalar), chunk: int, a: int, lane: int):
-            """Of point ``a`` of a strip."""
+            """Of point ``a`` of a row."""
             offset = points[(chunk * wp.static(width) + a) * wp.static(CHUNK) + lane]
             value = vector()
             for i in range(wp.static(dim)):
@@ -54,43 +86,79 @@ class _Readers:
             return value
 
         @wp.func
-        def gradients(B: wp.array(dtype=scalar), cell: int, lane: int):
-            """D_m^-1 [1/m]; ``cell`` is where the cells of one place in the strips begin."""
+        def gradients(B: wp.array(dtype=scalar), place: int, lane: int):
+            """D_m^-1 [1/m]; ``place`` is where the quadrature points of one place in the rows begin."""
             value = matrix()
             for a in range(wp.static(dim)):
                 for i in range(wp.static(dim)):
-                    value[a, i] = B[cell * wp.static(dim * dim) + (a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
+                    value[a, i] = B[place * wp.static(dim * dim) + (a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
             return value
 
         @wp.func
-        def parameters(p: wp.array(dtype=scalar), cell: int, lane: int):
+        def parameters(p: wp.array(dtype=scalar), place: int, lane: int):
             """The material's."""
             value = parameter_vector()
             for i in range(wp.static(parameter_count)):
                 if wp.static(uniform):
                     value[i] = p[i]
                 else:
-                    value[i] = p[cell * wp.static(parameter_count) + i * wp.static(CHUNK) + lane]
+                    value[i] = p[place * wp.static(parameter_count) + i * wp.static(CHUNK) + lane]
             return value
 
         self.displacement, self.gradients, self.parameters = displacement, gradients, parameters
 
 
 @functools.cache
-def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: bool) -> wp.Kernel:
+def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform: bool) -> wp.Kernel:
+    dim, row = shape.dim, _Row(shape)
     t = types(dim, dtype)
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
-    width = STRIP + dim
-    strip_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
+    width, places, terms = row.width, row.places, row.terms
+    points, weights = row.points.tolist(), row.weights.tolist()
+    row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
     stress, direct_stress = constitutive.stress, constitutive.direct_stress
     direct = direct_stress is not None
-    read = _Readers(constitutive.parameter_count, dim, dtype, uniform)
+    read = _Readers(row, constitutive.parameter_count, dim, dtype, uniform)
     read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
 
+    @wp.func
+    def internal_forces(
+        x: row_vectors,
+        B: wp.array(dtype=scalar),
+        volumes: wp.array(dtype=scalar),
+        p: wp.array(dtype=scalar),
+        known: wp.array(dtype=scalar),
+        chunk: int,
+        lane: int,
+    ):
+        """On the points of a row at their displacements ``x``."""
+        f = row_vectors()
+        for k in range(wp.static(places)):
+            place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
+            gradients = read_gradients(B, place, lane)
+            H = matrix()
+            for a in range(wp.static(dim)):
+                change = wp.static(scalar(weights[k][a][0])) * x[wp.static(points[k][a][0])]
+                for n in range(1, wp.static(terms)):
+                    change += wp.static(scalar(weights[k][a][n])) * x[wp.static(points[k][a][n])]
+                H += wp.outer(change, gradients[a])
+            own = read_parameters(p, place, lane)
+            if wp.static(direct):
+                P, holds = direct_stress(H, own)
+                known[k * wp.static(CHUNK) + lane] = scalar(holds)
+                weighted = -volumes[place + lane] * select(holds == 1, P, matrix())
+            else:
+                weighted = -volumes[place + lane] * stress(H, own)
+            for a in range(wp.static(dim)):
+                share = weighted * gradients[a]
+                for n in range(wp.static(terms)):
+                    f[wp.static(points[k][a][n])] += wp.static(scalar(weights[k][a][n])) * share
+        return f
+
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiler_flags(4)})
-    def strip_force(
+    def row_force(
         first: int,
-        strip_points: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.int32),
         inverse_shape: wp.array(dtype=scalar),
         volume: wp.array(dtype=scalar),
         parameters: wp.array(dtype=scalar),
@@ -98,40 +166,23 @@ def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: boo
         force_out: wp.array(dtype=scalar),
         known_out: wp.array(dtype=scalar),
     ):
-        """Writes the internal forces on the points of the strips of chunk ``first + tid``.
+        """Writes the internal forces on the points of the rows of chunk ``first + tid``.
 
-        With a direct stress, cells where it does not hold exert none, and 0 is written for them instead of 1.
+        With a direct stress, places where it does not hold exert none, and 0 is written for them instead of 1.
         """
         chunk = first + wp.tid()
-        own_points = wp.array(ptr=strip_points.ptr, shape=(0,), dtype=wp.int32)
+        own_points = wp.array(ptr=row_points.ptr, shape=(0,), dtype=wp.int32)
         B = wp.array(ptr=inverse_shape.ptr, shape=(0,), dtype=scalar)
         volumes = wp.array(ptr=volume.ptr, shape=(0,), dtype=scalar)
         p = wp.array(ptr=parameters.ptr, shape=(0,), dtype=scalar)
         displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
         forces = wp.zeros(shape=(wp.static(width * dim * CHUNK),), dtype=scalar)
-        known = wp.zeros(shape=(wp.static(STRIP * CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
+        known = wp.zeros(shape=(wp.static(places * CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
         for lane in range(wp.static(CHUNK)):
-            x = strip_vectors()
+            x = row_vectors()
             for a in range(wp.static(width)):
                 x[a] = read_displacement(own_points, displacement, chunk, a, lane)
-            f = strip_vectors()
-            for k in range(wp.static(STRIP)):
-                cell = (chunk * wp.static(STRIP) + k) * wp.static(CHUNK)
-                gradients = read_gradients(B, cell, lane)
-                H = matrix()
-                for a in range(wp.static(dim)):
-                    H += wp.outer(x[k + 1 + a] - x[k], gradients[a])
-                own = read_parameters(p, cell, lane)
-                if wp.static(direct):
-                    P, holds = direct_stress(H, own)
-                    known[k * wp.static(CHUNK) + lane] = scalar(holds)
-                    weighted = -volumes[cell + lane] * select(holds == 1, P, matrix())
-                else:
-                    weighted = -volumes[cell + lane] * stress(H, own)
-                for a in range(wp.static(dim)):
-                    corner = weighted * gradients[a]
-                    f[k + 1 + a] += corner
-                    f[k] -= corner
+            f = internal_forces(x, B, volumes, p, known, chunk, lane)
             for a in range(wp.static(width)):
                 for i in range(wp.static(dim)):
                     forces[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane] = f[a, i]
@@ -139,25 +190,28 @@ def _force_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: boo
         for entry in range(wp.static(width * dim * CHUNK)):
             out[chunk * wp.static(width * dim * CHUNK) + entry] = forces[entry]
         if wp.static(direct):
-            for place in range(wp.static(STRIP * CHUNK)):
-                known_out[chunk * wp.static(STRIP * CHUNK) + place] = known[place]
+            for place in range(wp.static(places * CHUNK)):
+                known_out[chunk * wp.static(places * CHUNK) + place] = known[place]
 
-    return strip_force
+    return row_force
 
 
 @functools.cache
-def _remainder_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform: bool) -> wp.Kernel:
+def _remainder_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform: bool) -> wp.Kernel:
+    dim, row = shape.dim, _Row(shape)
     t = types(dim, dtype)
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
-    width = STRIP + dim
+    width, places, terms = row.width, row.places, row.terms
+    point_table = wp.types.matrix(shape=(places * dim, terms), dtype=wp.int32)(row.points.ravel().tolist())
+    weight_table = wp.types.matrix(shape=(places * dim, terms), dtype=scalar)(row.weights.ravel().tolist())
     stress = constitutive.stress
-    read = _Readers(constitutive.parameter_count, dim, dtype, uniform)
+    read = _Readers(row, constitutive.parameter_count, dim, dtype, uniform)
     read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
 
     @wp.kernel(module="unique", enable_backward=False)
     def remaining_force(
         first: int,
-        strip_points: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.int32),
         inverse_shape: wp.array(dtype=scalar),
         volume: wp.array(dtype=scalar),
         parameters: wp.array(dtype=scalar),
@@ -165,28 +219,33 @@ def _remainder_kernel(constitutive: Constitutive, dim: int, dtype: str, uniform:
         force_out: wp.array(dtype=scalar),
         known: wp.array(dtype=scalar),
     ):
-        """Adds the forces of those cells of chunk ``first + tid`` that the direct stress left out, one at a time."""
+        """Adds the forces of those places of chunk ``first + tid`` that the direct stress left out, one at a time."""
         chunk = first + wp.tid()
         displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
-        for place in range(wp.static(STRIP * CHUNK)):
-            if known[chunk * wp.static(STRIP * CHUNK) + place] == scalar(0.0):
-                k = place // wp.static(CHUNK)
-                lane = place % wp.static(CHUNK)
-                cell = (chunk * wp.static(STRIP) + k) * wp.static(CHUNK)
-                gradients = read_gradients(inverse_shape, cell, lane)
-                origin = read_displacement(strip_points, displacement, chunk, k, lane)
+        points = wp.static(point_table)
+        weights = wp.static(weight_table)
+        for left in range(wp.static(places * CHUNK)):
+            if known[chunk * wp.static(places * CHUNK) + left] == scalar(0.0):
+                k = left // wp.static(CHUNK)
+                lane = left % wp.static(CHUNK)
+                place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
+                gradients = read_gradients(inverse_shape, place, lane)
                 H = matrix()
                 for a in range(wp.static(dim)):
-                    H += wp.outer(
-                        read_displacement(strip_points, displacement, chunk, k + 1 + a, lane) - origin, gradients[a]
-                    )
-                weighted = -volume[cell + lane] * stress(H, read_parameters(parameters, cell, lane))
-                start = (chunk * wp.static(width) + k) * wp.static(dim * CHUNK) + lane
+                    change = vector()
+                    for n in range(wp.static(terms)):
+                        point = points[k * wp.static(dim) + a, n]
+                        x = read_displacement(row_points, displacement, chunk, point, lane)
+                        change += weights[k * wp.static(dim) + a, n] * x
+                    H += wp.outer(change, gradients[a])
+                weighted = -volume[place + lane] * stress(H, read_parameters(parameters, place, lane))
+                start = chunk * wp.static(width * dim * CHUNK) + lane
                 for a in range(wp.static(dim)):
-                    corner = weighted * gradients[a]
-                    for i in range(wp.static(dim)):
-                        force_out[start + ((1 + a) * wp.static(dim) + i) * wp.static(CHUNK)] += corner[i]
-                        force_out[start + i * wp.static(CHUNK)] -= corner[i]
+                    share = weighted * gradients[a]
+                    for n in range(wp.static(terms)):
+                        target = start + points[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK)
+                        for i in range(wp.static(dim)):
+                            force_out[target + i * wp.static(CHUNK)] += weights[k * wp.static(dim) + a, n] * share[i]
 
     return remaining_force
 
@@ -198,18 +257,18 @@ def _sum_kernel(dim: int, dtype: str) -> wp.Kernel:
     rows = wp.types.matrix(shape=(dim, LANES), dtype=scalar)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiler_flags(12)})
-    def sum_strip_forces(
+    def sum_row_forces(
         first: int,
         entry_starts: wp.array(dtype=wp.int32),
         entries: wp.array(dtype=wp.int32),
         points: wp.array(dtype=wp.int32),
-        strip_forces: wp.array(dtype=scalar),
+        row_forces: wp.array(dtype=scalar),
         force_out: wp.array(dtype=vector),
     ):
-        """Adds to each of the points of group ``first + tid`` the forces of its strips."""
+        """Adds to each of the points of group ``first + tid`` the forces of its rows."""
         group = first + wp.tid()
         places = wp.array(ptr=entries.ptr, shape=(0,), dtype=wp.int32)
-        forces = wp.array(ptr=strip_forces.ptr, shape=(0,), dtype=scalar)
+        forces = wp.array(ptr=row_forces.ptr, shape=(0,), dtype=scalar)
         total = rows()
         for entry in range(entry_starts[group], entry_starts[group + 1]):
             term = rows()
@@ -226,24 +285,24 @@ def _sum_kernel(dim: int, dtype: str) -> wp.Kernel:
                     value[i] = total[i, lane]
                 force_out[point] += value
 
-    return sum_strip_forces
+    return sum_row_forces
 
 
 class VectorizedForce:
-    """The internal force of the cells of one material, in strips.
+    """The internal force of the cells of one material, in rows.
 
     Args:
         kernels: the plain kernels of the material.
-        host_cells: (count, dim + 1) int, the cells' points in the model.
+        host_cells: (count, k) int, the cells' points in the model.
         rest_points: of the model, (point_count, dim) [m].
-        inverse_shape: D_m^-1 of each cell, (count, dim, dim) [1/m].
-        volumes: (count,) [m^3].
+        inverse_shape: D_m^-1 of each quadrature point, cell by cell, (count * q, dim, dim) [1/m].
+        volumes: likewise, (count * q,) [m^3].
         parameters: the material's, (1, k) if uniform, else (count, k).
         team: the threads among which :meth:`add` divides its work.
 
     Attributes:
-        known: for a material with a direct stress, 1 for each cell of the strips where it held in the last forces
-            computed, else 0.
+        known: for a material with a direct stress, 1 for each quadrature point of the rows where it held in the last
+            forces computed, else 0.
     """
 
     def __init__(
@@ -259,37 +318,52 @@ class VectorizedForce:
         self._team = team
         self._recordings = Recordings()
         t = kernels.types
+        shape = kernels.shape
         dim = self.dim = kernels.dim
         dtype = t.name
         uniform = len(parameters) == 1
-        made_for = (kernels.constitutive, dim, dtype, uniform)
+        made_for = (kernels.constitutive, shape, dtype, uniform)
         self._kernels = [_force_kernel(*made_for)]
         if kernels.constitutive.direct_stress is not None:
             self._kernels.append(_remainder_kernel(*made_for))
         self._sum = _sum_kernel(dim, dtype)
-        strips = cut_into_strips(rest_points, host_cells)
-        self.chunk_count = -(-len(strips.cells) // CHUNK)
-        missing = self.chunk_count * CHUNK - len(strips.cells)
-        points = np.pad(strips.points, ((0, missing), (0, 0)), mode="edge")
-        cells = np.pad(strips.cells, ((0, missing), (0, 0)), constant_values=-1)
-        real = cells >= 0
+        if shape.order == 1:
+            strips = cut_into_strips(rest_points, host_cells)
+            points, quadrature = strips.points, strips.cells
+        else:
+            order = order_in_space(rest_points, host_cells)
+            points = host_cells[order]
+            quadrature = order[:, None] * shape.quadrature_count + np.arange(shape.quadrature_count)
+        self.chunk_count = -(-len(points) // CHUNK)
+        missing = self.chunk_count * CHUNK - len(points)
+        points = np.pad(points, ((0, missing), (0, 0)), mode="edge")
+        quadrature = np.pad(quadrature, ((0, missing), (0, 0)), constant_values=-1)
+        real = quadrature >= 0
+        if shape.order == 1:
+            gradients = self._gradients(host_cells, inverse_shape, points, quadrature)
+            occupied = np.zeros(points.shape, dtype=bool)
+            for k in range(STRIP):
+                occupied[:, k : k + dim + 1] |= real[:, k, None]
+        else:
+            gradients = np.where(real[:, :, None, None], inverse_shape[quadrature], 0.0)
+            occupied = np.repeat(real[:, :1], points.shape[1], axis=1)
+        if not uniform:
+            of_cells = parameters[quadrature // shape.quadrature_count]
         self.arrays_by_name = {
-            "strip_points": self._blocked(dim * points, wp.int32),
-            "inverse_shape": self._blocked(self._gradients(host_cells, inverse_shape, points, cells), t.scalar),
-            "volume": self._blocked(np.where(real, volumes[cells], 0.0), t.scalar),
+            "row_points": self._blocked(dim * points, wp.int32),
+            "inverse_shape": self._blocked(gradients, t.scalar),
+            "volume": self._blocked(np.where(real, volumes[quadrature], 0.0), t.scalar),
             "parameters": wp.array(parameters.ravel(), dtype=t.scalar, device="cpu")
             if uniform
-            else self._blocked(np.where(real[:, :, None], parameters[cells], parameters[0]), t.scalar),
+            else self._blocked(np.where(real[:, :, None], of_cells, parameters[0]), t.scalar),
         }
-        width = STRIP + dim
-        size = self.chunk_count * width * dim * CHUNK
-        self._strip_forces = wp.zeros(size + dim * CHUNK, dtype=t.scalar, device="cpu")  # zeros at the end, for padding
-        flags = self.chunk_count * STRIP * CHUNK if len(self._kernels) == 2 else 0
-        self.known = wp.zeros(flags, dtype=t.scalar, device="cpu")
-        self._list_entries(points, real, zero=size)
+        size = points.size * dim
+        self._row_forces = wp.zeros(size + dim * CHUNK, dtype=t.scalar, device="cpu")  # zeros at the end, for padding
+        self.known = wp.zeros(quadrature.size if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
+        self._list_entries(points, occupied, zero=size)
 
     def _blocked(self, rows: np.ndarray, dtype: type) -> wp.array:
-        """Rows of strips (count, ...) as one array with the strips of a chunk innermost."""
+        """Rows (count, ...) as one array with those of a chunk innermost."""
         blocks = rows.reshape(self.chunk_count, CHUNK, -1).transpose(0, 2, 1)
         return wp.array(np.ascontiguousarray(blocks, dtype=wp.dtype_to_numpy(dtype)).ravel(), dtype=dtype, device="cpu")
 
@@ -307,15 +381,12 @@ class VectorizedForce:
             result[rows, k] = gradients[own[:, None], places]
         return result
 
-    def _list_entries(self, points: np.ndarray, real: np.ndarray, zero: int) -> None:
+    def _list_entries(self, points: np.ndarray, occupied: np.ndarray, zero: int) -> None:
         """The places of the forces on each point, for ``LANES`` points at a time."""
         width, dim = points.shape[1], self.dim
-        occupied = np.zeros(points.shape, dtype=bool)
-        for k in range(STRIP):
-            occupied[:, k : k + dim + 1] |= real[:, k, None]
-        strip, a = np.nonzero(occupied)
-        place = (strip // CHUNK * width + a) * (dim * CHUNK) + strip % CHUNK
-        point = points[strip, a]
+        row, a = np.nonzero(occupied)
+        place = (row // CHUNK * width + a) * (dim * CHUNK) + row % CHUNK
+        point = points[row, a]
         order = np.argsort(point, kind="stable")
         point, place = point[order], place[order]
         own, first, counts = np.unique(point, return_index=True, return_counts=True)
@@ -346,14 +417,14 @@ class VectorizedForce:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [*self.arrays_by_name.values(), self._strip_forces, self.known, *self._lists]
+        return [*self.arrays_by_name.values(), self._row_forces, self.known, *self._lists]
 
     def record_forces(self, u: wp.array, chunks: range) -> list[wp.Launch]:
         """The launches that compute the forces of a range of chunks at the displacements ``u``, in their order."""
         if not chunks:
             return []
         inputs = [chunks.start, *self.arrays_by_name.values(), u]
-        outputs = [self._strip_forces, self.known]
+        outputs = [self._row_forces, self.known]
         return [
             wp.launch(kernel, len(chunks), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
             for kernel in self._kernels
@@ -366,7 +437,7 @@ class VectorizedForce:
         """
         ends = np.searchsorted(self.windows, [points.start // WINDOW, -(-points.stop // WINDOW)])
         first, last = self.group_starts[ends].tolist()
-        inputs = [first, *self._lists, self._strip_forces]
+        inputs = [first, *self._lists, self._row_forces]
         return wp.launch(self._sum, last - first, inputs=inputs, outputs=[force_out], device="cpu", record_cmd=True)
 
     def add(self, u: wp.array, force_out: wp.array) -> None:

@@ -22,9 +22,11 @@ _FLAGS = compiler_flags(4, "capture-tracking-max-uses-to-explore=10000", "max-in
 
 
 def can_vectorize(block: CellBlock) -> bool:
-    """Whether a block's stiffness can be computed so: where its forces are, unless its differential has branches."""
+    """Whether a block's stiffness can be computed so: where the forces of linear cells are, unless its differential has
+    branches."""
     constitutive = block.kernels.constitutive
-    return block.vectorized is not None and (constitutive.branchless or constitutive.rotated_differential is not None)
+    possible = block.vectorized is not None and block.shape.order == 1
+    return possible and (constitutive.branchless or constitutive.rotated_differential is not None)
 
 
 class _Readers:
