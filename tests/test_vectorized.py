@@ -165,10 +165,9 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
     for module in ("model", "solvers.explicit"):
         monkeypatch.setattr(f"warpfem.{module}.CELLS_PER_THREAD", 256)
-    monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
+    monkeypatch.setattr("warpfem.row_sums.BLOCK", 1)
     if not isinstance(solver, wf.BackwardEuler):
         monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)  # as if there were many bodies
-    monkeypatch.setattr(explicit, "WINDOW", 64)
     monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
     monkeypatch.setattr("warpfem.linear.operators.SLICED_POINTS", 64)
     monkeypatch.setattr("warpfem.linear.slices.SLICES_PER_THREAD", 1)

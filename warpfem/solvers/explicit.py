@@ -20,7 +20,6 @@ from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, 
 from warpfem.solvers.stability import Watch, largest_frequency
 from warpfem.subnormals import SubnormalsFlushed
 from warpfem.threads import Job, share
-from warpfem.vectorized import WINDOW
 
 TRACKING_INTERVALS = (16, 1024)
 """Bounds of the steps after which the stability limit is estimated again, at the cost of some twenty steps: the fewer
@@ -81,8 +80,8 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
 class _Passes:
     """A step of vectorised bodies as two passes of recorded launches, each divided among threads.
 
-    The first computes the forces of the strips, the second sums them for each point and moves it. Which thread does
-    what changes no bit of the result.
+    The first computes the forces of the cells and sums them for each point, but for points that threads have in common;
+    the second adds the forces on those, and moves the points. Which thread does what changes no bit of the result.
 
     Attributes:
         threads: among which steps are divided.
@@ -93,7 +92,7 @@ class _Passes:
         self._force = force
         self._team = model.team
         self.threads = max(1, min(self._team.size, model.cell_count // CELLS_PER_THREAD))
-        self._points = share(model.point_count, self.threads, WINDOW)
+        self._points = share(model.point_count, self.threads, CHUNK)
         self._recordings = Recordings()
 
     def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
@@ -113,11 +112,10 @@ class _Passes:
         first: list[list[wp.Launch | None]] = [[] for _ in self._points]
         second: list[list[wp.Launch | None]] = [[] for _ in self._points]
         for force in self._forces:
-            for launches, part in zip(first, share(force.chunk_count, self.threads), strict=True):
-                launches.extend(force.record_forces(state.u, part))
-            for launches, points in zip(second, self._points, strict=True):
-                launches.append(force.record_sums(self._force, points))
+            for launches, own in zip(first, force.record(state.u, self._force, self.threads), strict=True):
+                launches.extend(own)
         for launches, points in zip(second, self._points, strict=True):
+            launches.extend(force.record_aside(self._force, points, self.threads) for force in self._forces)
             launches.append(kick_drift(state, points, *settings))
         as_graphs = self.threads > 1  # on one thread the whole step is a graph
         return jobs(first, SubnormalsFlushed, as_graphs), jobs(second, SubnormalsFlushed, as_graphs)
