@@ -9,7 +9,8 @@ from itertools import pairwise
 from queue import SimpleQueue
 
 CELLS_PER_THREAD = 8192
-"""Cells for which a thread is worth while: handing over work costs as much as the forces of some thousand."""
+"""Cells, quadratic ones counted by their quadrature points, for which a thread is worth while: handing over work costs
+as much as the forces of some thousand."""
 
 Job = Callable[[], None]
 

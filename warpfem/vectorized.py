@@ -127,12 +127,12 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         B: wp.array(dtype=scalar),
         volumes: wp.array(dtype=scalar),
         p: wp.array(dtype=scalar),
-        known: wp.array(dtype=scalar),
         chunk: int,
         lane: int,
     ):
-        """On the points of a row at their displacements ``x``."""
+        """On the points of a row at their displacements ``x``, and the sum of 2^k over places k of known stress."""
         f = row_vectors()
+        known = scalar(0.0)
         for k in range(wp.static(places)):
             place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
             gradients = read_gradients(B, place, lane)
@@ -145,7 +145,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
             own = read_parameters(p, place, lane)
             if wp.static(direct):
                 P, holds = direct_stress(H, own)
-                known[k * wp.static(CHUNK) + lane] = scalar(holds)
+                known += wp.static(scalar(2**k)) * scalar(holds)
                 weighted = -volumes[place + lane] * select(holds == 1, P, matrix())
             else:
                 weighted = -volumes[place + lane] * stress(H, own)
@@ -153,9 +153,11 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
                 share = weighted * gradients[a]
                 for n in range(wp.static(terms)):
                     f[wp.static(points[k][a][n])] += wp.static(scalar(weights[k][a][n])) * share
-        return f
+        return f, known
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiler_flags(4)})
+    flags = compiler_flags(4, inlined=30000)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def row_force(
         first: int,
         row_points: wp.array(dtype=wp.int32),
@@ -168,7 +170,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
     ):
         """Writes the internal forces on the points of the rows of chunk ``first + tid``.
 
-        With a direct stress, places where it does not hold exert none, and 0 is written for them instead of 1.
+        With a direct stress, places where it does not hold exert none, and are left out of what is written as known.
         """
         chunk = first + wp.tid()
         own_points = wp.array(ptr=row_points.ptr, shape=(0,), dtype=wp.int32)
@@ -177,12 +179,14 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         p = wp.array(ptr=parameters.ptr, shape=(0,), dtype=scalar)
         displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
         forces = wp.zeros(shape=(wp.static(width * dim * CHUNK),), dtype=scalar)
-        known = wp.zeros(shape=(wp.static(places * CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
+        known = wp.zeros(shape=(wp.static(CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
         for lane in range(wp.static(CHUNK)):
             x = row_vectors()
             for a in range(wp.static(width)):
                 x[a] = read_displacement(own_points, displacement, chunk, a, lane)
-            f = internal_forces(x, B, volumes, p, known, chunk, lane)
+            f, holds = internal_forces(x, B, volumes, p, chunk, lane)
+            if wp.static(direct):
+                known[lane] = holds
             for a in range(wp.static(width)):
                 for i in range(wp.static(dim)):
                     forces[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane] = f[a, i]
@@ -190,8 +194,8 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         for entry in range(wp.static(width * dim * CHUNK)):
             out[chunk * wp.static(width * dim * CHUNK) + entry] = forces[entry]
         if wp.static(direct):
-            for place in range(wp.static(places * CHUNK)):
-                known_out[chunk * wp.static(places * CHUNK) + place] = known[place]
+            for lane in range(wp.static(CHUNK)):
+                known_out[chunk * wp.static(CHUNK) + lane] = known[lane]
 
     return row_force
 
@@ -224,28 +228,32 @@ def _remainder_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
         displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
         points = wp.static(point_table)
         weights = wp.static(weight_table)
-        for left in range(wp.static(places * CHUNK)):
-            if known[chunk * wp.static(places * CHUNK) + left] == scalar(0.0):
-                k = left // wp.static(CHUNK)
-                lane = left % wp.static(CHUNK)
-                place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
-                gradients = read_gradients(inverse_shape, place, lane)
-                H = matrix()
-                for a in range(wp.static(dim)):
-                    change = vector()
-                    for n in range(wp.static(terms)):
-                        point = points[k * wp.static(dim) + a, n]
-                        x = read_displacement(row_points, displacement, chunk, point, lane)
-                        change += weights[k * wp.static(dim) + a, n] * x
-                    H += wp.outer(change, gradients[a])
-                weighted = -volume[place + lane] * stress(H, read_parameters(parameters, place, lane))
-                start = chunk * wp.static(width * dim * CHUNK) + lane
-                for a in range(wp.static(dim)):
-                    share = weighted * gradients[a]
-                    for n in range(wp.static(terms)):
-                        target = start + points[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK)
-                        for i in range(wp.static(dim)):
-                            force_out[target + i * wp.static(CHUNK)] += weights[k * wp.static(dim) + a, n] * share[i]
+        for lane in range(wp.static(CHUNK)):
+            held = int(known[chunk * wp.static(CHUNK) + lane])
+            k = int(0)
+            while held != wp.static(2**places - 1):
+                if (held >> k) % 2 == 0:
+                    held += 1 << k
+                    place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
+                    gradients = read_gradients(inverse_shape, place, lane)
+                    H = matrix()
+                    for a in range(wp.static(dim)):
+                        change = vector()
+                        for n in range(wp.static(terms)):
+                            point = points[k * wp.static(dim) + a, n]
+                            x = read_displacement(row_points, displacement, chunk, point, lane)
+                            change += weights[k * wp.static(dim) + a, n] * x
+                        H += wp.outer(change, gradients[a])
+                    weighted = -volume[place + lane] * stress(H, read_parameters(parameters, place, lane))
+                    start = chunk * wp.static(width * dim * CHUNK) + lane
+                    for a in range(wp.static(dim)):
+                        share = weighted * gradients[a]
+                        for n in range(wp.static(terms)):
+                            weight = weights[k * wp.static(dim) + a, n]
+                            target = start + points[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK)
+                            for i in range(wp.static(dim)):
+                                force_out[target + i * wp.static(CHUNK)] += weight * share[i]
+                k += 1
 
     return remaining_force
 
@@ -301,8 +309,8 @@ class VectorizedForce:
         team: the threads among which :meth:`add` divides its work.
 
     Attributes:
-        known: for a material with a direct stress, 1 for each quadrature point of the rows where it held in the last
-            forces computed, else 0.
+        known: for a material with a direct stress, for each row the sum of 2^k over those of its quadrature points k
+            where it held in the last forces computed.
     """
 
     def __init__(
@@ -359,7 +367,7 @@ class VectorizedForce:
         }
         size = points.size * dim
         self._row_forces = wp.zeros(size + dim * CHUNK, dtype=t.scalar, device="cpu")  # zeros at the end, for padding
-        self.known = wp.zeros(quadrature.size if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
+        self.known = wp.zeros(len(points) if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
         self._list_entries(points, occupied, zero=size)
 
     def _blocked(self, rows: np.ndarray, dtype: type) -> wp.array:

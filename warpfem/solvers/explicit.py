@@ -27,8 +27,8 @@ TRACKING_INTERVALS = (16, 1024)
 cells, the sooner a wave has crossed them, and the less it matters."""
 
 VECTORIZED_CELLS = 1024
-"""Cells of a material from which on its forces are computed several cells at a time: that takes some seconds to compile
-once, and work to prepare."""
+"""Cells of a material, quadratic ones counted by their quadrature points, from which on its forces are computed several
+cells at a time: that takes some seconds to compile once, and work to prepare."""
 
 CELLS_PER_THREAD = 16384
 """Cells for which a thread is worth while in explicit steps: handing over their two passes takes as long as fewer."""
@@ -92,7 +92,7 @@ class _Passes:
         self._forces = [block.vectorized for block in model.blocks]
         self._force = force
         self._team = model.team
-        self.threads = max(1, min(self._team.size, model.cell_count // CELLS_PER_THREAD))
+        self.threads = max(1, min(self._team.size, model.quadrature_count // CELLS_PER_THREAD))
         self._points = share(model.point_count, self.threads, WINDOW)
         self._recordings = Recordings()
 
