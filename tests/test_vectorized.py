@@ -62,6 +62,7 @@ def _scene(mesh, material, **settings):
     [
         (wf.StableNeoHookean, "3D, single precision, one modulus"),
         (wf.NeoHookean, "2D, double precision, moduli per cell"),
+        (wf.StableNeoHookean, "curved 3D, double precision, moduli per cell"),
         *(
             pytest.param(kind, case, marks=pytest.mark.slow)
             for kind in (
@@ -71,12 +72,21 @@ def _scene(mesh, material, **settings):
                 wf.StableNeoHookean,
                 wf.FixedCorotated,
             )
-            for case in ("3D, double precision, moduli per cell", "2D, single precision, one modulus")
+            for case in (
+                "3D, double precision, moduli per cell",
+                "2D, single precision, one modulus",
+                "curved 3D, single precision, one modulus",
+                "curved 2D, double precision, moduli per cell",
+            )
         ),
     ],
 )
 def test_the_forces_are_those_of_the_plain_kernel(kind, case):
     mesh = MESHES["box" if "3D" in case else "rectangle"]
+    if "curved" in case:  # quadratic cells, whose gradients differ from one quadrature point to another
+        straight = mesh.quadratic()
+        bent = 0.1 * mesh.mean_edge_length * np.sin(7.0 * straight.points[:, ::-1])
+        mesh = wf.Mesh(straight.points + bent, straight.cells)
     dtype, limit = ("float32", 2e-6) if "single" in case else ("float64", 1e-14)
     E = 1e5 if "one" in case else np.linspace(1e5, 1e6, mesh.cell_count)
     model = wf.Model(_scene(mesh, kind(E=E, nu=0.3)), device="cpu", dtype=dtype)
@@ -89,9 +99,10 @@ def test_the_forces_are_those_of_the_plain_kernel(kind, case):
     assert 0.0 < difference <= limit * np.abs(plain).max()  # equal bits would be those of the plain kernel
 
 
-def test_cells_that_the_direct_stress_leaves_out_have_that_of_the_plain_kernel():
+@pytest.mark.parametrize("order", [1, 2])
+def test_cells_that_the_direct_stress_leaves_out_have_that_of_the_plain_kernel(order):
     """Fixed corotated from strains of 1e-7 to cells flattened and turned inside out."""
-    mesh = MESHES["box"]
+    mesh = MESHES["box"] if order == 1 else wf.Mesh.box((1, 1, 1), (4, 4, 4)).quadratic()
     model = wf.Model(_scene(mesh, wf.FixedCorotated(E=1e5, nu=0.3)), device="cpu")
     noise = np.random.default_rng(0).normal(size=mesh.points.shape)
     flattened = -mesh.points * (0.0, 0.0, 1.0)
@@ -105,9 +116,10 @@ def test_cells_that_the_direct_stress_leaves_out_have_that_of_the_plain_kernel()
     for state, plain in zip(states, expected, strict=True):
         difference = np.abs(model.internal_force(state) - plain).max()
         assert 0.0 < difference <= 2e-6 * np.abs(plain).max()
-        known.append(model.blocks[0].vectorized.known.numpy().mean())
-    assert known[:3] == [1.0, 1.0, 1.0]
-    assert 0.5 < known[4] < 1.0
+        known.append(model.blocks[0].vectorized.known.numpy().copy())
+    full = 2 ** (STRIP if order == 1 else mesh.shape.quadrature_count) - 1
+    assert all((of_rows == full).all() for of_rows in known[:3])
+    assert 0.0 < (known[4] < full).mean() < 1.0
 
 
 @pytest.mark.parametrize(
@@ -160,11 +172,10 @@ def test_small_bodies_and_materials_with_branches_keep_the_plain_kernel():
     ids=["symplectic Euler", "Verlet", "backward Euler"],
 )
 def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
-    """With a body that is large enough for all threads, and one of another material that is too small for that."""
+    """With a body that is large enough for all threads, and a quadratic one that is too small for that."""
     for module in (explicit, implicit):
         monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
-    for module in ("model", "solvers.explicit"):
-        monkeypatch.setattr(f"warpfem.{module}.CELLS_PER_THREAD", 256)
+    monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.row_sums.BLOCK", 1)
     if not isinstance(solver, wf.BackwardEuler):
         monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)  # as if there were many bodies
@@ -176,7 +187,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     results = []
     for threads in (1, 2, 3):
         body = wf.Body("body", mesh, wf.StableNeoHookean(E=1e5, nu=0.3), supports=[wf.Pin("bottom")])
-        small = wf.Body("small", MESHES["box of six"], wf.LinearElasticity(E=1e5, nu=0.3))
+        small = wf.Body("small", MESHES["box of six"], wf.LinearElasticity(E=1e5, nu=0.3), element="quadratic")
         scene = wf.Scene([body, small], solver, gravity=(0, -9.81, 0), damping=1.0)
         model = wf.Model(scene, device="cpu", threads=threads)
         stepper, state = solver.stepper(model), model.state()

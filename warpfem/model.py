@@ -209,7 +209,8 @@ class CellBlock:
         return [*self.arguments.values(), *own]
 
     def vectorize(self, rest_points: np.ndarray, least: int, team: Team) -> None:
-        """Prepares the force of several cells at a time, where that is possible and there are ``least`` cells."""
+        """Prepares the force of several cells at a time, where that is possible and there are ``least`` quadrature
+        points."""
         constitutive = self.kernels.constitutive
         # a GPU has lanes of its own, and adds to points by atomics, which it does well
         possible = self.device.is_cpu and not self.averaged
@@ -297,7 +298,7 @@ class Model:
         dtype: "float32" or "float64".
         threads: threads of the CPU that steps may use; the results do not depend on them.
         types: the Warp types.
-        point_count, cell_count: totals over the bodies.
+        point_count, cell_count, quadrature_count: points, cells and their quadrature points, totals over the bodies.
         point_starts, cell_starts: first point and cell of each body, with the total at the end.
         mass: lumped mass of each point [kg], device array.
         inverse_mass: its inverse.
@@ -337,6 +338,7 @@ class Model:
         self.cell_starts = np.concatenate([[0], np.cumsum([mesh.cell_count for mesh in meshes])])
         self.point_count = int(self.point_starts[-1])
         self.cell_count = int(self.cell_starts[-1])
+        self.quadrature_count = sum(mesh.cell_count * mesh.shape.quadrature_count for mesh in meshes)
         self.host_mass = _lumped_mass(scene) if lumped_mass is None else lumped_mass
         self.mass = self._device_array(self.host_mass, self.types.scalar)
         self.inverse_mass = self._device_array(1.0 / self.host_mass, self.types.scalar)
@@ -438,7 +440,7 @@ class Model:
     @cached_property
     def team(self) -> Team:
         """The threads that steps use, as many as the cells are worth."""
-        return Team(max(1, min(self.threads, self.cell_count // CELLS_PER_THREAD)) if self.device.is_cpu else 1)
+        return Team(max(1, min(self.threads, self.quadrature_count // CELLS_PER_THREAD)) if self.device.is_cpu else 1)
 
     @cached_property
     def static_load(self) -> wp.array | None:
@@ -541,21 +543,25 @@ class Model:
     def vectorize(self, least: int) -> None:
         """Prepares the forces of steps on the CPU: of several cells at a time, where a material has ``least`` of them.
 
-        Fewer are not worth the seconds that the compiler takes the first time.
+        A quadratic cell counts by its quadrature points. Fewer are not worth the seconds that the compiler takes the
+        first time.
         """
         for block in self.blocks:
             block.vectorize(self.rest_points, least, self.team)
 
-    def describe_forces(self, threads: int | None = None) -> str:
-        """How :meth:`add_internal_force` computes them, and on how many threads, if not on the whole team."""
-        count = sum(block.count for block in self.blocks if block.vectorized)
-        if not count:
+    def describe_forces(self) -> str:
+        """How :meth:`add_internal_force` computes them, and on how many threads."""
+        together = [block for block in self.blocks if block.vectorized]
+        if not together:
             return "one cell at a time, on one thread"
-        plain = self.cell_count - count
+        strips = sum(block.count for block in together if block.shape.order == 1)
+        quadratic = sum(block.count for block in together if block.shape.order == 2)
+        kinds = [f"{strips} cells in strips of {STRIP}"] if strips else []
+        kinds += [f"{quadratic} quadratic cells"] if quadratic else []
+        plain = self.cell_count - strips - quadratic
         others = f", {plain} others one at a time" if plain else ""
-        size = threads or self.team.size
-        team = "1 thread" if size == 1 else f"{size} threads"
-        return f"{count} cells in strips of {STRIP}, several at a time in vector registers{others}; {team}"
+        team = "1 thread" if self.team.size == 1 else f"{self.team.size} threads"
+        return f"{' and '.join(kinds)}, several at a time in vector registers{others}; {team}"
 
     def internal_force(self, state: State) -> np.ndarray:
         """Internal forces -dU/du of a state, (point_count, dim) float64 [N]."""

@@ -12,10 +12,12 @@ the length to negative indices, and adding 0 needs no test) with strides that ar
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
+from warpfem.barrier import Barrier
 from warpfem.dtypes import types
 from warpfem.elements import ElementKernels
 from warpfem.launches import Recordings, jobs
@@ -118,12 +120,12 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         B: wp.array(dtype=scalar),
         volumes: wp.array(dtype=scalar),
         p: wp.array(dtype=scalar),
-        known: wp.array(dtype=scalar),
         chunk: int,
         lane: int,
     ):
-        """On the points of a row at their displacements ``x``."""
+        """On the points of a row at their displacements ``x``, and the sum of 2^k over places k of known stress."""
         f = row_vectors()
+        known = scalar(0.0)
         for k in range(wp.static(places)):
             place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
             gradients = read_gradients(B, place, lane)
@@ -136,7 +138,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
             own = read_parameters(p, place, lane)
             if wp.static(direct):
                 P, holds = direct_stress(H, own)
-                known[k * wp.static(CHUNK) + lane] = scalar(holds)
+                known += wp.static(scalar(2**k)) * scalar(holds)
                 weighted = -volumes[place + lane] * select(holds == 1, P, matrix())
             else:
                 weighted = -volumes[place + lane] * stress(H, own)
@@ -144,9 +146,11 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
                 share = weighted * gradients[a]
                 for n in range(wp.static(terms)):
                     f[wp.static(points[k][a][n])] += wp.static(scalar(weights[k][a][n])) * share
-        return f
+        return f, known
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiler_flags(4)})
+    flags = compiler_flags(4, inlined=30000)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def row_force(
         first: int,
         row_points: wp.array(dtype=wp.int32),
@@ -159,7 +163,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
     ):
         """Writes the internal forces on the points of the rows of chunk ``first + tid`` in place ``tid``.
 
-        With a direct stress, places where it does not hold exert none, and 0 is written for them instead of 1.
+        With a direct stress, places where it does not hold exert none, and are left out of what is written as known.
         """
         chunk = first + wp.tid()
         own_points = wp.array(ptr=row_points.ptr, shape=(0,), dtype=wp.int32)
@@ -168,12 +172,14 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         p = wp.array(ptr=parameters.ptr, shape=(0,), dtype=scalar)
         displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
         forces = wp.zeros(shape=(wp.static(width * dim * CHUNK),), dtype=scalar)
-        known = wp.zeros(shape=(wp.static(places * CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
+        known = wp.zeros(shape=(wp.static(CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
         for lane in range(wp.static(CHUNK)):
             x = row_vectors()
             for a in range(wp.static(width)):
                 x[a] = read_displacement(own_points, displacement, chunk, a, lane)
-            f = internal_forces(x, B, volumes, p, known, chunk, lane)
+            f, holds = internal_forces(x, B, volumes, p, chunk, lane)
+            if wp.static(direct):
+                known[lane] = holds
             for a in range(wp.static(width)):
                 for i in range(wp.static(dim)):
                     forces[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane] = f[a, i]
@@ -181,8 +187,8 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         for entry in range(wp.static(width * dim * CHUNK)):
             out[wp.tid() * wp.static(width * dim * CHUNK) + entry] = forces[entry]
         if wp.static(direct):
-            for place in range(wp.static(places * CHUNK)):
-                known_out[chunk * wp.static(places * CHUNK) + place] = known[place]
+            for lane in range(wp.static(CHUNK)):
+                known_out[chunk * wp.static(CHUNK) + lane] = known[lane]
 
     return row_force
 
@@ -215,28 +221,32 @@ def _remainder_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
         displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
         points = wp.static(point_table)
         weights = wp.static(weight_table)
-        for left in range(wp.static(places * CHUNK)):
-            if known[chunk * wp.static(places * CHUNK) + left] == scalar(0.0):
-                k = left // wp.static(CHUNK)
-                lane = left % wp.static(CHUNK)
-                place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
-                gradients = read_gradients(inverse_shape, place, lane)
-                H = matrix()
-                for a in range(wp.static(dim)):
-                    change = vector()
-                    for n in range(wp.static(terms)):
-                        point = points[k * wp.static(dim) + a, n]
-                        x = read_displacement(row_points, displacement, chunk, point, lane)
-                        change += weights[k * wp.static(dim) + a, n] * x
-                    H += wp.outer(change, gradients[a])
-                weighted = -volume[place + lane] * stress(H, read_parameters(parameters, place, lane))
-                start = wp.tid() * wp.static(width * dim * CHUNK) + lane
-                for a in range(wp.static(dim)):
-                    share = weighted * gradients[a]
-                    for n in range(wp.static(terms)):
-                        target = start + points[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK)
-                        for i in range(wp.static(dim)):
-                            force_out[target + i * wp.static(CHUNK)] += weights[k * wp.static(dim) + a, n] * share[i]
+        for lane in range(wp.static(CHUNK)):
+            held = int(known[chunk * wp.static(CHUNK) + lane])
+            k = int(0)
+            while held != wp.static(2**places - 1):
+                if (held >> k) % 2 == 0:
+                    held += 1 << k
+                    place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
+                    gradients = read_gradients(inverse_shape, place, lane)
+                    H = matrix()
+                    for a in range(wp.static(dim)):
+                        change = vector()
+                        for n in range(wp.static(terms)):
+                            point = points[k * wp.static(dim) + a, n]
+                            x = read_displacement(row_points, displacement, chunk, point, lane)
+                            change += weights[k * wp.static(dim) + a, n] * x
+                        H += wp.outer(change, gradients[a])
+                    weighted = -volume[place + lane] * stress(H, read_parameters(parameters, place, lane))
+                    start = wp.tid() * wp.static(width * dim * CHUNK) + lane
+                    for a in range(wp.static(dim)):
+                        share = weighted * gradients[a]
+                        for n in range(wp.static(terms)):
+                            weight = weights[k * wp.static(dim) + a, n]
+                            target = start + points[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK)
+                            for i in range(wp.static(dim)):
+                                force_out[target + i * wp.static(CHUNK)] += weight * share[i]
+                k += 1
 
     return remaining_force
 
@@ -254,8 +264,8 @@ class VectorizedForce:
         team: the threads among which :meth:`add` divides its work.
 
     Attributes:
-        known: for a material with a direct stress, 1 for each quadrature point of the rows where it held in the last
-            forces computed, else 0.
+        known: for a material with a direct stress, for each row the sum of 2^k over those of its quadrature points k
+            where it held in the last forces computed.
     """
 
     def __init__(
@@ -273,7 +283,7 @@ class VectorizedForce:
         t = kernels.types
         shape = kernels.shape
         dim = self.dim = kernels.dim
-        dtype = self._dtype = t.name
+        dtype = t.name
         uniform = len(parameters) == 1
         made_for = (kernels.constitutive, shape, dtype, uniform)
         self._kernels = [_force_kernel(*made_for)]
@@ -309,9 +319,8 @@ class VectorizedForce:
             if uniform
             else self._blocked(np.where(real[:, :, None], of_cells, parameters[0]), t.scalar),
         }
-        self.known = wp.zeros(quadrature.size if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
-        self._occupied = occupied
-        self._sums: dict[int, RowSums] = {}
+        self.known = wp.zeros(len(points) if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
+        self._sums = RowSums(points, occupied, dim, dtype, team.size)
 
     def _blocked(self, rows: np.ndarray, dtype: type) -> wp.array:
         """Rows (count, ...) as one array with those of a chunk innermost."""
@@ -334,51 +343,43 @@ class VectorizedForce:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [*self.arrays_by_name.values(), self.known, *(a for sums in self._sums.values() for a in sums.arrays())]
+        return [*self.arrays_by_name.values(), self.known, *self._sums.arrays()]
 
-    def record(self, u: wp.array, force_out: wp.array, threads: int) -> list[list[wp.Launch | None]]:
+    def record(self, u: wp.array, force_out: wp.array) -> list[list[wp.Launch | None]]:
         """The launches of each thread that add the internal forces at ``u`` to ``force_out``, in their order.
 
-        Where there are several threads, those of :meth:`record_aside` are to follow.
+        Once all threads are done, those of :meth:`record_aside` are to follow.
         """
-        sums = self._of_threads(threads)
-        launches: list[list[wp.Launch | None]] = []
-        for thread, blocks in enumerate(sums.blocks):
-            launches.append([])
-            for block in blocks:
-                chunks = sums.chunks[block]
-                inputs = [chunks.start, *self.arrays_by_name.values(), u]
-                outputs = [sums.scratch[thread], self.known]
-                for kernel in self._kernels:
-                    launch = wp.launch(
-                        kernel, len(chunks), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True
-                    )
-                    launches[-1].append(launch)
-                launches[-1].append(sums.record_block(block, thread, force_out))
+        return [self._record_blocks(thread, u, force_out) for thread in range(self._team.size)]
+
+    def _record_blocks(self, thread: int, u: wp.array, force_out: wp.array) -> list[wp.Launch | None]:
+        launches = []
+        for block in self._sums.blocks[thread]:
+            chunks = self._sums.chunks[block]
+            inputs = [chunks.start, *self.arrays_by_name.values(), u]
+            outputs = [self._sums.scratch[thread], self.known]
+            for kernel in self._kernels:
+                launch = wp.launch(kernel, len(chunks), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
+                launches.append(launch)
+            launches.append(self._sums.record_block(block, thread, force_out))
         return launches
 
-    def record_aside(self, force_out: wp.array, points: range, threads: int) -> wp.Launch | None:
+    def record_aside(self, force_out: wp.array, points: range) -> wp.Launch | None:
         """The launch that then adds what threads have put aside to a range of points; ``None`` for nothing."""
-        return self._of_threads(threads).record_aside(force_out, points)
-
-    def _of_threads(self, threads: int) -> RowSums:
-        if threads not in self._sums:
-            points = self.arrays_by_name["row_points"].numpy().reshape(self.chunk_count, -1, CHUNK) // self.dim
-            rows = points.transpose(0, 2, 1).reshape(self._occupied.shape)
-            self._sums[threads] = RowSums(rows, self._occupied, self.dim, self._dtype, threads)
-        return self._sums[threads]
+        return self._sums.record_aside(force_out, points)
 
     def add(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the internal forces at ``u`` to ``force_out``."""
         key = (u.ptr, force_out.ptr, wp.get_device("cpu").is_capturing)
-        for part in self._recordings.get(key, lambda: self._record(u, force_out)):
-            self._team.run(part)
+        run, work = self._recordings.get(key, lambda: self._record(u, force_out))
+        run(work)
 
-    def _record(self, u: wp.array, force_out: wp.array) -> list[list[Job]]:
+    def _record(self, u: wp.array, force_out: wp.array) -> tuple[Callable[[list[Job]], None], list[Job]]:
         size = self._team.size
-        alone = not wp.get_device("cpu").is_capturing
-        result = [jobs(self.record(u, force_out, size), as_graphs=alone)]
-        if size > 1:
-            parts = share(len(force_out), size)
-            result.append(jobs([[self.record_aside(force_out, part, size)] for part in parts], as_graphs=alone))
-        return result
+        launches = self.record(u, force_out)
+        if size == 1:
+            return self._team.run, jobs(launches, as_graphs=not wp.get_device("cpu").is_capturing)
+        barrier = Barrier(self._team)
+        for own, points in zip(launches, share(len(force_out), size), strict=True):
+            own += [barrier.record(), self.record_aside(force_out, points)]
+        return barrier.run, jobs(launches)
