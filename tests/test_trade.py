@@ -107,6 +107,24 @@ def test_settings_are_all_combinations_without_what_does_not_apply(bar):
         parse_axes(["cells=1", "cells=2"], problem)
 
 
+def test_values_bring_settings_that_win_over_other_axes(bar):
+    problem = Problem.of(bar)
+    axes = parse_axes(["cells=1,2:solver=velocity_verlet:dt=auto", "solver=sdirk2", "dt=1/40,1/80"], problem)
+    labels = [setting.label for setting in settings_of(axes, problem)]
+    assert labels == [
+        "cells=1 solver=sdirk2 dt=1/40",
+        "cells=1 solver=sdirk2 dt=1/80",
+        "cells=2 solver=velocity_verlet dt=auto",  # once, whatever other axes list
+    ]
+    assert axes[0].values == ("1", "2")
+    (named,) = parse_axes(["E=at 12:30"], problem)
+    assert named.values == ("at 12:30",)  # brings nothing
+    with pytest.raises(SceneError, match="no axis 'dtt'; did you mean 'dt'"):
+        parse_axes(["solver=velocity_verlet:dtt=auto"], problem)
+    with pytest.raises(SceneError, match="frames is no axis"):
+        parse_axes(["cells=1,2:frames=3"], problem)
+
+
 def test_a_setting_makes_its_scene(bar):
     problem = Problem.of(bar, {"E": "2e5"}, frames=3)
 

@@ -32,8 +32,9 @@ def add(commands: Any) -> None:
         dest="axes",
         metavar="NAME=VALUE,...",
         help="what to vary, may be repeated: a parameter of the scene, or dt, solver, element, material, dtype, refine "
-        "(how often all cells are divided), or a setting of the solver such as tolerance; without any, the mesh, the "
-        "element, the scheme and dt",
+        "(how often all cells are divided), or a setting of the solver such as tolerance; a value may bring others, "
+        "which win over their axes: solver=sdirk2,velocity_verlet:dt=auto; without any axis, the mesh, the element, "
+        "the scheme and dt",
     )
     trade.add_argument(
         "--error",

@@ -33,14 +33,17 @@ class Axis:
     Attributes:
         name: a parameter of the scene, or one of those that change any scene.
         values: as text.
+        brought: pairs of a name and a value that come with each of the values, whatever other axes say; empty if none
+            brings any.
     """
 
     name: str
     values: tuple[str, ...]
+    brought: tuple[tuple[tuple[str, str], ...], ...] = ()
 
 
 def parse_axes(texts: Sequence[str], problem: Problem) -> list[Axis]:
-    """Axes from texts such as ``cells=4,8,16``.
+    """Axes from texts such as ``cells=4,8,16`` or ``solver=sdirk2,velocity_verlet:dt=auto``.
 
     Raises:
         SceneError: a text is no axis, or names none that there is.
@@ -49,23 +52,38 @@ def parse_axes(texts: Sequence[str], problem: Problem) -> list[Axis]:
     axes: list[Axis] = []
     for text in texts:
         name, equals, listed = text.partition("=")
-        values = tuple(dict.fromkeys(value.strip() for value in listed.split(",") if value.strip()))
-        if not equals or not values:
+        entries = [_entry(value.strip()) for value in listed.split(",") if value.strip()]
+        if not equals or not entries:
             raise SceneError(f"--axis takes NAME=VALUE,VALUE,..., for example --axis cells=4,8,16, not '{text}'")
-        if name in ("frames", "fps"):
-            raise SceneError(f"{name} is no axis: the motions of all settings are compared frame by frame")
-        require_known(name, parameters)
+        for own in [name, *(other for _, brought in entries for other, _ in brought)]:
+            if own in ("frames", "fps"):
+                raise SceneError(f"{own} is no axis: the motions of all settings are compared frame by frame")
+            require_known(own, parameters)
         if name in {axis.name for axis in axes}:
             raise SceneError(f"--axis {name} is given twice: list all values in one")
-        axes.append(Axis(name, values))
+        values, brought = zip(*dict.fromkeys(entries), strict=True)
+        axes.append(Axis(name, values, brought if any(brought) else ()))
     return axes
 
 
+def _entry(text: str) -> tuple[str, tuple[tuple[str, str], ...]]:
+    """A value and what it brings, as in ``velocity_verlet:dt=auto``; a text with other colons is a value."""
+    value, *others = text.split(":")
+    pairs = tuple((name, brought) for name, equals, brought in (own.partition("=") for own in others) if equals)
+    return (value, pairs) if len(pairs) == len(others) else (text, ())
+
+
 def settings_of(axes: Sequence[Axis], problem: Problem) -> list[Setting]:
-    """All combinations of the values, without what a combination's solver does not have, each once."""
+    """All combinations of the values, with what these bring, without what its solver does not have, each once.
+
+    Of what two axes bring for one name, that of the later one counts.
+    """
     names = [axis.name for axis in axes]
-    combinations = product(*(axis.values for axis in axes))
-    settings = [Setting(tuple(zip(names, values, strict=True))) for values in combinations]
+    entries = [zip(axis.values, axis.brought or [()] * len(axis.values), strict=True) for axis in axes]
+    settings = []
+    for combination in product(*entries):
+        plain = Setting(tuple(zip(names, (value for value, _ in combination), strict=True)))
+        settings.append(plain.changed(**{name: value for _, brought in combination for name, value in brought}))
     reduced = []
     for setting in settings:
         try:

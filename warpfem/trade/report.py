@@ -219,8 +219,11 @@ def rows(own: Sweep) -> list[dict[str, Any]]:
     An axis can be called as a measured number is, such as ``cells``: its column is ``axis_cells``.
     """
     table = []
+    names = dict.fromkeys(
+        [*(axis.name for axis in own.axes), *(name for point in own.points for name in dict(point.setting))]
+    )
     for record in data(own)["settings"]:
-        row = {f"axis_{axis.name}": record["setting"].get(axis.name, "") for axis in own.axes}
+        row = {f"axis_{name}": record["setting"].get(name, "") for name in names}
         row |= {"failure": record["failure"], "load": own.study.load, "on_front": record["on_front"]}
         for name, value in record.items():
             if name in ("errors", "quantities"):
