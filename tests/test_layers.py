@@ -23,7 +23,7 @@ LAYERS = [
         "subnormals",
         "vector_code",
     },
-    {"mesh", "points", "launches", "quantities", "log_file"},
+    {"mesh", "points", "launches", "quantities", "log_file", "barrier", "row_sums"},
     {"materials"},
     {"stiffness"},
     {"elements", "meshing", "folds", "patches", "patch_kernels", "places"},

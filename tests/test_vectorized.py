@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import warpfem as wf
+from warpfem.barrier import Barrier
 from warpfem.linear import tangent_operator
 from warpfem.solvers import explicit, implicit
 from warpfem.strips import STRIP, cut_into_strips
@@ -175,12 +176,10 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     """With a body that is large enough for all threads, and a quadratic one that is too small for that."""
     for module in (explicit, implicit):
         monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
-    for module in ("model", "solvers.explicit"):
-        monkeypatch.setattr(f"warpfem.{module}.CELLS_PER_THREAD", 256)
-    monkeypatch.setattr("warpfem.vectorized.WINDOW", 64)
+    monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
+    monkeypatch.setattr("warpfem.row_sums.BLOCK", 1)
     if not isinstance(solver, wf.BackwardEuler):
         monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)  # as if there were many bodies
-    monkeypatch.setattr(explicit, "WINDOW", 64)
     monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
     monkeypatch.setattr("warpfem.linear.operators.SLICED_POINTS", 64)
     monkeypatch.setattr("warpfem.linear.slices.SLICES_PER_THREAD", 1)
@@ -274,6 +273,36 @@ def test_a_team_runs_all_jobs_and_passes_on_a_failure():
         team.run([lambda: None, fail])
     team.run([lambda: seen.append(3)])
     assert seen[-1] == 3
+
+
+def test_no_thread_passes_a_barrier_before_all_have_come():
+    """With more threads than most machines for tests have cores."""
+    barrier, seen = Barrier(Team(5)), []
+    wait = barrier.record()
+
+    def work():
+        seen.append("before")
+        wait.launch()
+        seen.append("after")
+
+    for _ in range(20):
+        barrier.run([work] * 5)
+    assert seen == (["before"] * 5 + ["after"] * 5) * 20
+
+
+@pytest.mark.parametrize("failing", [0, 2])
+@pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
+def test_a_thread_that_fails_holds_no_other_at_a_barrier(failing, failure):
+    barrier = Barrier(Team(3))
+    wait = barrier.record()
+
+    def fail():
+        time.sleep(0.01)
+        raise failure("a job")
+
+    with pytest.raises(failure, match="a job"):
+        barrier.run([fail if thread == failing else wait.launch for thread in range(3)])
+    barrier.run([wait.launch] * 3)
 
 
 @pytest.mark.usefixtures("interrupts")

@@ -549,8 +549,8 @@ class Model:
         for block in self.blocks:
             block.vectorize(self.rest_points, least, self.team)
 
-    def describe_forces(self, threads: int | None = None) -> str:
-        """How :meth:`add_internal_force` computes them, and on how many threads, if not on the whole team."""
+    def describe_forces(self) -> str:
+        """How :meth:`add_internal_force` computes them, and on how many threads."""
         together = [block for block in self.blocks if block.vectorized]
         if not together:
             return "one cell at a time, on one thread"
@@ -560,8 +560,7 @@ class Model:
         kinds += [f"{quadratic} quadratic cells"] if quadratic else []
         plain = self.cell_count - strips - quadratic
         others = f", {plain} others one at a time" if plain else ""
-        size = threads or self.team.size
-        team = "1 thread" if size == 1 else f"{size} threads"
+        team = "1 thread" if self.team.size == 1 else f"{self.team.size} threads"
         return f"{' and '.join(kinds)}, several at a time in vector registers{others}; {team}"
 
     def internal_force(self, state: State) -> np.ndarray:

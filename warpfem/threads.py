@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from operator import length_hint
 from queue import SimpleQueue
 
 CELLS_PER_THREAD = 8192
@@ -17,8 +19,8 @@ Job = Callable[[], None]
 Outcomes = list[BaseException | None]
 """Of the jobs that have ended: what they have raised."""
 
-Task = tuple[Job, Outcomes, SimpleQueue[None]]
-"""A job, where its outcome goes, and what tells the caller to look there."""
+Task = tuple[Job, Job, Outcomes, SimpleQueue[None]]
+"""A job, what to do at once if it fails, where its outcome goes, and what tells the caller to look there."""
 
 
 def available_threads() -> int:
@@ -41,26 +43,32 @@ class Team:
         for inbox in self._inboxes:
             threading.Thread(target=_work, args=(inbox,), daemon=True).start()
 
-    def run(self, jobs: Sequence[Job]) -> None:
+    def run(self, jobs: Sequence[Job], release: Job = lambda: None) -> None:
         """Runs at most ``size`` jobs at the same time, the first by the calling thread, and waits for all.
+
+        Args:
+            jobs: what to run.
+            release: called as soon as a job has failed, by its thread: others may be waiting for it.
 
         Raises:
             BaseException: what a job has raised, or an interrupt, once all have ended: until then they work on arrays
                 that the caller might free.
         """
-        others = jobs[1:]
         outcomes: Outcomes = []
         news: SimpleQueue[None] = SimpleQueue()
         failures: list[BaseException] = []
-        for inbox, job in zip(self._inboxes, others, strict=False):
-            inbox.put((job, outcomes, news))
+        tasks = [(job, release, outcomes, news) for job in jobs[1:]]
+        left = iter(tasks)
         try:
+            deque(map(SimpleQueue.put, self._inboxes, left), maxlen=0)  # no interrupt comes between two of them
             jobs[0]()
         except BaseException as failure:
+            release()
             failures.append(failure)
-        while len(outcomes) < len(others):
+        handed = len(tasks) - length_hint(left)
+        while len(outcomes) < handed:
             try:
-                while len(outcomes) < len(others):
+                while len(outcomes) < handed:
                     news.get()
             except KeyboardInterrupt as interrupt:
                 failures.append(interrupt)
@@ -75,10 +83,11 @@ class Team:
 
 def _work(inbox: SimpleQueue[Task | None]) -> None:
     while (task := inbox.get()) is not None:
-        job, outcomes, news = task
+        job, release, outcomes, news = task
         try:
             job()
         except BaseException as failure:
+            release()
             outcomes.append(failure)
         else:
             outcomes.append(None)

@@ -3,8 +3,7 @@
 One task takes a chunk of rows in a loop over unit-stride data with the rows in the innermost place, which the compiler
 turns into vector code of the width that the processor has. A row is a strip of linear cells (see ``strips.py``) or one
 quadratic cell: points, and some quadrature points whose deformation gradients depend on those. The forces on the points
-of the rows go to an array of their own; a second kernel sums them for each point through an index list, always in the
-same order: without atomics, with the same bits however the tasks are divided among threads.
+of the rows go to an array of their own, from which a second kernel sums them for each point (see ``row_sums.py``).
 
 What lets the compiler do it: the material's stress has no branches (``Constitutive.branchless``), or one without them
 that tells where it holds (``direct_stress``; the remaining cells are then taken one at a time); results are kept on
@@ -13,28 +12,22 @@ the length to negative indices, and adding 0 needs no test) with strides that ar
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
+from warpfem.barrier import Barrier
 from warpfem.dtypes import types
 from warpfem.elements import ElementKernels
 from warpfem.launches import Recordings, jobs
 from warpfem.materials.base import Constitutive
+from warpfem.row_sums import CHUNK, RowSums
 from warpfem.shapes import Shape
 from warpfem.strips import STRIP, cut_into_strips, order_in_space
 from warpfem.tensor import select
 from warpfem.threads import Job, Team, share
 from warpfem.vector_code import compiler_flags
-
-CHUNK = 64
-"""Rows of one task: their forces (4.6 kB of strips, in single precision) fit the first-level cache with all else."""
-
-LANES = 8
-"""Points that are summed at a time."""
-
-WINDOW = 512
-"""Points among which those of equal numbers of rows are brought together, so that lanes are not idle."""
 
 
 class _Row:
@@ -168,7 +161,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         force_out: wp.array(dtype=scalar),
         known_out: wp.array(dtype=scalar),
     ):
-        """Writes the internal forces on the points of the rows of chunk ``first + tid``.
+        """Writes the internal forces on the points of the rows of chunk ``first + tid`` in place ``tid``.
 
         With a direct stress, places where it does not hold exert none, and are left out of what is written as known.
         """
@@ -192,7 +185,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
                     forces[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane] = f[a, i]
         out = wp.array(ptr=force_out.ptr, shape=(0,), dtype=scalar)
         for entry in range(wp.static(width * dim * CHUNK)):
-            out[chunk * wp.static(width * dim * CHUNK) + entry] = forces[entry]
+            out[wp.tid() * wp.static(width * dim * CHUNK) + entry] = forces[entry]
         if wp.static(direct):
             for lane in range(wp.static(CHUNK)):
                 known_out[chunk * wp.static(CHUNK) + lane] = known[lane]
@@ -245,7 +238,7 @@ def _remainder_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
                             change += weights[k * wp.static(dim) + a, n] * x
                         H += wp.outer(change, gradients[a])
                     weighted = -volume[place + lane] * stress(H, read_parameters(parameters, place, lane))
-                    start = chunk * wp.static(width * dim * CHUNK) + lane
+                    start = wp.tid() * wp.static(width * dim * CHUNK) + lane
                     for a in range(wp.static(dim)):
                         share = weighted * gradients[a]
                         for n in range(wp.static(terms)):
@@ -256,44 +249,6 @@ def _remainder_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
                 k += 1
 
     return remaining_force
-
-
-@functools.cache
-def _sum_kernel(dim: int, dtype: str) -> wp.Kernel:
-    t = types(dim, dtype)
-    scalar, vector = t.scalar, t.vector
-    rows = wp.types.matrix(shape=(dim, LANES), dtype=scalar)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": compiler_flags(12)})
-    def sum_row_forces(
-        first: int,
-        entry_starts: wp.array(dtype=wp.int32),
-        entries: wp.array(dtype=wp.int32),
-        points: wp.array(dtype=wp.int32),
-        row_forces: wp.array(dtype=scalar),
-        force_out: wp.array(dtype=vector),
-    ):
-        """Adds to each of the points of group ``first + tid`` the forces of its rows."""
-        group = first + wp.tid()
-        places = wp.array(ptr=entries.ptr, shape=(0,), dtype=wp.int32)
-        forces = wp.array(ptr=row_forces.ptr, shape=(0,), dtype=scalar)
-        total = rows()
-        for entry in range(entry_starts[group], entry_starts[group + 1]):
-            term = rows()
-            for lane in range(wp.static(LANES)):
-                place = places[entry * wp.static(LANES) + lane]
-                for i in range(wp.static(dim)):
-                    term[i, lane] = forces[place + i * wp.static(CHUNK)]
-            total += term
-        for lane in range(wp.static(LANES)):
-            point = points[group * wp.static(LANES) + lane]
-            if point >= 0:
-                value = vector()
-                for i in range(wp.static(dim)):
-                    value[i] = total[i, lane]
-                force_out[point] += value
-
-    return sum_row_forces
 
 
 class VectorizedForce:
@@ -334,7 +289,6 @@ class VectorizedForce:
         self._kernels = [_force_kernel(*made_for)]
         if kernels.constitutive.direct_stress is not None:
             self._kernels.append(_remainder_kernel(*made_for))
-        self._sum = _sum_kernel(dim, dtype)
         if shape.order == 1:
             strips = cut_into_strips(rest_points, host_cells)
             points, quadrature = strips.points, strips.cells
@@ -365,10 +319,8 @@ class VectorizedForce:
             if uniform
             else self._blocked(np.where(real[:, :, None], of_cells, parameters[0]), t.scalar),
         }
-        size = points.size * dim
-        self._row_forces = wp.zeros(size + dim * CHUNK, dtype=t.scalar, device="cpu")  # zeros at the end, for padding
         self.known = wp.zeros(len(points) if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
-        self._list_entries(points, occupied, zero=size)
+        self._sums = RowSums(points, occupied, dim, dtype, team.size)
 
     def _blocked(self, rows: np.ndarray, dtype: type) -> wp.array:
         """Rows (count, ...) as one array with those of a chunk innermost."""
@@ -389,73 +341,45 @@ class VectorizedForce:
             result[rows, k] = gradients[own[:, None], places]
         return result
 
-    def _list_entries(self, points: np.ndarray, occupied: np.ndarray, zero: int) -> None:
-        """The places of the forces on each point, for ``LANES`` points at a time."""
-        width, dim = points.shape[1], self.dim
-        row, a = np.nonzero(occupied)
-        place = (row // CHUNK * width + a) * (dim * CHUNK) + row % CHUNK
-        point = points[row, a]
-        order = np.argsort(point, kind="stable")
-        point, place = point[order], place[order]
-        own, first, counts = np.unique(point, return_index=True, return_counts=True)
-        window = own // WINDOW
-        members = np.lexsort((own, -counts, window))
-        self.windows = np.unique(window)
-        group_counts = -(-np.bincount(window)[self.windows] // LANES)
-        self.group_starts = np.concatenate([[0], np.cumsum(group_counts)])
-        starts = np.concatenate([[0], np.cumsum(np.bincount(window)[self.windows])])
-        rank = np.searchsorted(self.windows, window[members])
-        slot = np.empty(len(own), dtype=np.int64)
-        slot[members] = self.group_starts[rank] * LANES + np.arange(len(own)) - starts[rank]
-        group_count = int(self.group_starts[-1])
-        longest = np.zeros(group_count, dtype=np.int64)
-        np.maximum.at(longest, slot // LANES, counts)
-        entry_starts = np.concatenate([[0], np.cumsum(longest)])
-        entries = np.full((int(entry_starts[-1]), LANES), zero, dtype=np.int32)
-        of_entry = np.repeat(np.arange(len(own)), counts)
-        turn = np.arange(len(point)) - first[of_entry]
-        entries[entry_starts[slot[of_entry] // LANES] + turn, slot[of_entry] % LANES] = place
-        group_points = np.full(group_count * LANES, -1, dtype=np.int32)
-        group_points[slot] = own
-
-        def device(array: np.ndarray) -> wp.array:
-            return wp.array(array.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-
-        self._lists = [device(entry_starts), device(entries), device(group_points)]
-
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [*self.arrays_by_name.values(), self._row_forces, self.known, *self._lists]
+        return [*self.arrays_by_name.values(), self.known, *self._sums.arrays()]
 
-    def record_forces(self, u: wp.array, chunks: range) -> list[wp.Launch]:
-        """The launches that compute the forces of a range of chunks at the displacements ``u``, in their order."""
-        if not chunks:
-            return []
-        inputs = [chunks.start, *self.arrays_by_name.values(), u]
-        outputs = [self._row_forces, self.known]
-        return [
-            wp.launch(kernel, len(chunks), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
-            for kernel in self._kernels
-        ]
+    def record(self, u: wp.array, force_out: wp.array) -> list[list[wp.Launch | None]]:
+        """The launches of each thread that add the internal forces at ``u`` to ``force_out``, in their order.
 
-    def record_sums(self, force_out: wp.array, points: range) -> wp.Launch | None:
-        """The launch that then adds the forces on a range of points, of whole windows, to ``force_out``.
-
-        ``None`` where none of the points is of these cells.
+        Once all threads are done, those of :meth:`record_aside` are to follow.
         """
-        ends = np.searchsorted(self.windows, [points.start // WINDOW, -(-points.stop // WINDOW)])
-        first, last = self.group_starts[ends].tolist()
-        inputs = [first, *self._lists, self._row_forces]
-        return wp.launch(self._sum, last - first, inputs=inputs, outputs=[force_out], device="cpu", record_cmd=True)
+        return [self._record_blocks(thread, u, force_out) for thread in range(self._team.size)]
+
+    def _record_blocks(self, thread: int, u: wp.array, force_out: wp.array) -> list[wp.Launch | None]:
+        launches = []
+        for block in self._sums.blocks[thread]:
+            chunks = self._sums.chunks[block]
+            inputs = [chunks.start, *self.arrays_by_name.values(), u]
+            outputs = [self._sums.scratch[thread], self.known]
+            for kernel in self._kernels:
+                launch = wp.launch(kernel, len(chunks), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
+                launches.append(launch)
+            launches.append(self._sums.record_block(block, thread, force_out))
+        return launches
+
+    def record_aside(self, force_out: wp.array, points: range) -> wp.Launch | None:
+        """The launch that then adds what threads have put aside to a range of points; ``None`` for nothing."""
+        return self._sums.record_aside(force_out, points)
 
     def add(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the internal forces at ``u`` to ``force_out``."""
-        key = (u.ptr, force_out.ptr)
-        for part in self._recordings.get(key, lambda: self._record(u, force_out)):
-            self._team.run(part)
+        key = (u.ptr, force_out.ptr, wp.get_device("cpu").is_capturing)
+        run, work = self._recordings.get(key, lambda: self._record(u, force_out))
+        run(work)
 
-    def _record(self, u: wp.array, force_out: wp.array) -> tuple[list[Job], list[Job]]:
+    def _record(self, u: wp.array, force_out: wp.array) -> tuple[Callable[[list[Job]], None], list[Job]]:
         size = self._team.size
-        forces = [self.record_forces(u, part) for part in share(self.chunk_count, size)]
-        sums = [[self.record_sums(force_out, part)] for part in share(len(force_out), size, WINDOW)]
-        return jobs(forces), jobs(sums)
+        launches = self.record(u, force_out)
+        if size == 1:
+            return self._team.run, jobs(launches, as_graphs=not wp.get_device("cpu").is_capturing)
+        barrier = Barrier(self._team)
+        for own, points in zip(launches, share(len(force_out), size), strict=True):
+            own += [barrier.record(), self.record_aside(force_out, points)]
+        return barrier.run, jobs(launches)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warpfem.barrier import Barrier
 from warpfem.dtypes import types
 from warpfem.errors import SimulationError, TimeStepError
 from warpfem.launches import Recordings, jobs
@@ -20,7 +21,6 @@ from warpfem.solvers.base import Solver, Stepper, StepReport, require_positive, 
 from warpfem.solvers.stability import Watch, largest_frequency
 from warpfem.subnormals import SubnormalsFlushed
 from warpfem.threads import Job, share
-from warpfem.vectorized import WINDOW
 
 TRACKING_INTERVALS = (16, 1024)
 """Bounds of the steps after which the stability limit is estimated again, at the cost of some twenty steps: the fewer
@@ -29,9 +29,6 @@ cells, the sooner a wave has crossed them, and the less it matters."""
 VECTORIZED_CELLS = 1024
 """Cells of a material, quadratic ones counted by their quadrature points, from which on its forces are computed several
 cells at a time: that takes some seconds to compile once, and work to prepare."""
-
-CELLS_PER_THREAD = 16384
-"""Cells for which a thread is worth while in explicit steps: handing over their two passes takes as long as fewer."""
 
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
@@ -81,19 +78,17 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
 class _Passes:
     """A step of vectorised bodies as two passes of recorded launches, each divided among threads.
 
-    The first computes the forces of the strips, the second sums them for each point and moves it. Which thread does
-    what changes no bit of the result.
-
-    Attributes:
-        threads: among which steps are divided.
+    The first computes the forces of the cells and sums them for each point, but for points that threads have in common;
+    the second adds the forces on those, and moves the points. In between, the threads wait for one another. Which
+    thread does what changes no bit of the result.
     """
 
     def __init__(self, model: Model, force: wp.array) -> None:
         self._forces = [block.vectorized for block in model.blocks]
         self._force = force
         self._team = model.team
-        self.threads = max(1, min(self._team.size, model.quadrature_count // CELLS_PER_THREAD))
-        self._points = share(model.point_count, self.threads, WINDOW)
+        self._barrier = Barrier(self._team) if self._team.size > 1 else None
+        self._points = share(model.point_count, self._team.size, CHUNK)
         self._recordings = Recordings()
 
     def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
@@ -106,21 +101,22 @@ class _Passes:
             settings: of the move.
         """
         key = (state.u.ptr, state.v.ptr, *settings)
-        for part in self._recordings.get(key, lambda: self._record(kick_drift, state, *settings)):
-            self._team.run(part)
+        work = self._recordings.get(key, lambda: self._record(kick_drift, state, *settings))
+        (self._team if self._barrier is None else self._barrier).run(work)
 
-    def _record(self, kick_drift: KickDrift, state: State, *settings: float) -> tuple[list[Job], list[Job]]:
-        first: list[list[wp.Launch | None]] = [[] for _ in self._points]
-        second: list[list[wp.Launch | None]] = [[] for _ in self._points]
+    def _record(self, kick_drift: KickDrift, state: State, *settings: float) -> list[Job]:
+        launches: list[list[wp.Launch | None]] = [[] for _ in self._points]
         for force in self._forces:
-            for launches, part in zip(first, share(force.chunk_count, self.threads), strict=True):
-                launches.extend(force.record_forces(state.u, part))
-            for launches, points in zip(second, self._points, strict=True):
-                launches.append(force.record_sums(self._force, points))
-        for launches, points in zip(second, self._points, strict=True):
-            launches.append(kick_drift(state, points, *settings))
-        as_graphs = self.threads > 1  # on one thread the whole step is a graph
-        return jobs(first, SubnormalsFlushed, as_graphs), jobs(second, SubnormalsFlushed, as_graphs)
+            for all_own, own in zip(launches, force.record(state.u, self._force), strict=True):
+                all_own.extend(own)
+        for own, points in zip(launches, self._points, strict=True):
+            if self._barrier is not None:
+                own.append(self._barrier.record())
+                own.extend(force.record_aside(self._force, points) for force in self._forces)
+            own.append(kick_drift(state, points, *settings))
+        return jobs(
+            launches, SubnormalsFlushed, as_graphs=self._team.size > 1
+        )  # on one thread the whole step is a graph
 
 
 class _ExplicitStepper(Stepper):
@@ -144,15 +140,11 @@ class _ExplicitStepper(Stepper):
             self._passes = _Passes(model, self._force)
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
         alone = model.team.size == 1 or not any(block.vectorized for block in model.blocks)  # others share their forces
-        self._as_graph = model.device.is_cpu and (alone if self._passes is None else self._passes.threads == 1)
+        self._as_graph = model.device.is_cpu and alone
         self._launched: Hashable = None  # what the last step's launches were made for
         self._graphs = Recordings()
         self._inverse_mass = self._free_inverse_mass()
         self._recordings = Recordings()
-
-    @property
-    def forces(self) -> str:
-        return self.model.describe_forces(None if self._passes is None else self._passes.threads)
 
     def step(self, state: State, dt: float) -> StepReport:
         self._begin(state, dt)

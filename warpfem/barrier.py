@@ -1,0 +1,79 @@
+"""A barrier within the work of several threads: none goes on before all have come, without a detour through Python."""
+
+import ctypes
+import functools
+import sys
+from collections.abc import Sequence
+
+import warp as wp
+
+from warpfem.threads import Job, Team
+
+RELEASED = 2**30
+"""What the count is set to so that no thread waits any more."""
+
+_WAIT = """
+    typedef wp::int32 (*Yield)();
+    __atomic_fetch_add(counter.data, 1, __ATOMIC_ACQ_REL);
+    for (wp::int32 turn = 0; __atomic_load_n(counter.data, __ATOMIC_ACQUIRE) < threads; ++turn) {
+        if (turn > 100) {  // some microseconds
+            turn = 100;
+            reinterpret_cast<Yield>(yield_address)();
+        }
+#if defined(__x86_64__)
+        __builtin_ia32_pause();
+#elif defined(__aarch64__)
+        __asm__ volatile("yield");
+#endif
+    }
+"""
+
+
+@wp.func_native(_WAIT)
+def _wait(counter: wp.array(dtype=wp.int32), threads: int, yield_address: wp.uint64): ...
+
+
+@functools.cache
+def _wait_kernel() -> wp.Kernel:
+    @wp.kernel(module="warpfem.barrier", enable_backward=False)
+    def wait_for_all(counter: wp.array(dtype=wp.int32), threads: int, yield_address: wp.uint64):
+        """Counts the calling thread, then waits until all are counted: in a loop, which soon lets others run."""
+        _wait(counter, threads, yield_address)
+
+    return wait_for_all
+
+
+def _yield_address() -> int:
+    """Of the system's function by which a thread lets others have its core."""
+    if sys.platform == "win32":
+        function = ctypes.windll.kernel32.SwitchToThread
+    else:
+        function = ctypes.CDLL(None).sched_yield
+    return ctypes.cast(function, ctypes.c_void_p).value
+
+
+class Barrier:
+    """A barrier that jobs of a team pass once in each run.
+
+    Args:
+        team: the threads, all of which have to come.
+    """
+
+    def __init__(self, team: Team) -> None:
+        self._team = team
+        self._counter = wp.zeros(1, dtype=wp.int32, device="cpu")
+        self._count = self._counter.numpy()
+        self._yield = wp.uint64(_yield_address())
+
+    def record(self) -> wp.Launch:
+        """The launch that waits."""
+        inputs = [self._counter, self._team.size, self._yield]
+        return wp.launch(_wait_kernel(), 1, inputs=inputs, device="cpu", record_cmd=True)
+
+    def run(self, jobs: Sequence[Job]) -> None:
+        """Runs the jobs of all threads, each of which launches the wait; none waits for one that has raised."""
+        self._count[0] = 0
+        self._team.run(jobs, self._release)
+
+    def _release(self) -> None:
+        self._count[0] = RELEASED
