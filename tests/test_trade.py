@@ -287,6 +287,7 @@ def test_the_front_and_its_answers():
     coarse = reference(4e-4)
     unclear = candidates([point(0.2, 1.0), point(0.001, 400.0)], coarse, "l2")
     assert "the reference itself may be off by 0.04 %" in answer(unclear, coarse, "l2", 1e-3).sentence
+    assert "known to be within 0.15 %" in answer(unclear, coarse, "l2", 1.5e-3).sentence
     outside = candidates([point(0.2, 1.0), point(0.002, 400.0)], coarse, "l2")
     assert "No setting of the sweep is within 0.1 %" in answer(outside, coarse, "l2", 1e-3).sentence
     assert "every setting failed" in answer([], own, "l2", 0.1).sentence

@@ -126,17 +126,18 @@ class Answer:
             price = "it is within that, too"
         elif self.next_seconds is not None:
             price += f", {rounded(self.next_seconds / own.seconds)} times as much"
+        within = "known to be within" if own.band > RESOLVED * self.target else "within"
         return (
-            f"The cheapest setting within {asked} is {own.point.setting.label}: {rounded(own.seconds)} s "
+            f"The cheapest setting {within} {asked} is {own.point.setting.label}: {rounded(own.seconds)} s "
             f"({rounded(least)} to {rounded(most)} s), off by {percent(own.error)} (± {percent(own.band)}); "
             f"the next factor of {NEXT:g}: {price}"
         )
 
 
 def answer(ordered: Sequence[Candidate], reference: Reference, name: str, target: float) -> Answer:
-    """The cheapest setting within an error.
+    """The cheapest setting that is known to be within an error.
 
-    It takes a reference that is four times as good, unless all settings are further off whatever that is.
+    There is no answer where none is known to be, but some may: where the reference does not tell.
 
     Args:
         ordered: the settings, from fast to slow.
@@ -147,11 +148,11 @@ def answer(ordered: Sequence[Candidate], reference: Reference, name: str, target
     band = reference.band(name)
     if not ordered:
         return Answer(name, target, "every setting failed, or has no value of it")
+    within = [own for own in ordered if own.bound <= target]
     outside = all(own.error - own.band > target for own in ordered)
-    if not band <= RESOLVED * target and not outside:
+    if not within and not outside and not band <= RESOLVED * target:
         return Answer(name, target, f"the reference itself may be off by {percent(band)}. {advice(reference, name)}")
     edge = front(ordered)
-    within = [own for own in ordered if own.bound <= target]
     goal = target / NEXT if within else target
     measured = [own for own in ordered if own.bound <= goal]
     seconds, unknown = (measured[0].seconds, "") if measured else _extrapolated(edge, goal)
