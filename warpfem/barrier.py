@@ -13,12 +13,12 @@ RELEASED = 2**30
 """What the count is set to so that no thread waits any more."""
 
 _WAIT = """
-    typedef wp::int32 (*Yield)();
+    typedef wp::int32 (*Rest)(wp::uint32);
     __atomic_fetch_add(counter.data, 1, __ATOMIC_ACQ_REL);
     for (wp::int32 turn = 0; __atomic_load_n(counter.data, __ATOMIC_ACQUIRE) < threads; ++turn) {
-        if (turn > 100) {  // some microseconds
-            turn = 100;
-            reinterpret_cast<Yield>(yield_address)();
+        if (turn > 2000) {  // some tens of microseconds; who looks on for longer takes the time of those that work
+            turn = 2000;
+            reinterpret_cast<Rest>(rest_address)(1);
         }
 #if defined(__x86_64__)
         __builtin_ia32_pause();
@@ -30,25 +30,25 @@ _WAIT = """
 
 
 @wp.func_native(_WAIT)
-def _wait(counter: wp.array(dtype=wp.int32), threads: int, yield_address: wp.uint64): ...
+def _wait(counter: wp.array(dtype=wp.int32), threads: int, rest_address: wp.uint64): ...
 
 
 @functools.cache
 def _wait_kernel() -> wp.Kernel:
     @wp.kernel(module="warpfem.barrier", enable_backward=False)
-    def wait_for_all(counter: wp.array(dtype=wp.int32), threads: int, yield_address: wp.uint64):
-        """Counts the calling thread, then waits until all are counted: in a loop, which soon lets others run."""
-        _wait(counter, threads, yield_address)
+    def wait_for_all(counter: wp.array(dtype=wp.int32), threads: int, rest_address: wp.uint64):
+        """Counts the calling thread, then waits until all are counted: in a loop, then asleep."""
+        _wait(counter, threads, rest_address)
 
     return wait_for_all
 
 
-def _yield_address() -> int:
-    """Of the system's function by which a thread lets others have its core."""
+def _rest_address() -> int:
+    """Of the system's function by which a thread lets others have its core, with the microseconds as its argument."""
     if sys.platform == "win32":
-        function = ctypes.windll.kernel32.SwitchToThread
+        function = ctypes.windll.kernel32.SwitchToThread  # takes none
     else:
-        function = ctypes.CDLL(None).sched_yield
+        function = ctypes.CDLL(None).usleep
     return ctypes.cast(function, ctypes.c_void_p).value
 
 
@@ -63,11 +63,11 @@ class Barrier:
         self._team = team
         self._counter = wp.zeros(1, dtype=wp.int32, device="cpu")
         self._count = self._counter.numpy()
-        self._yield = wp.uint64(_yield_address())
+        self._rest = wp.uint64(_rest_address())
 
     def record(self) -> wp.Launch:
         """The launch that waits."""
-        inputs = [self._counter, self._team.size, self._yield]
+        inputs = [self._counter, self._team.size, self._rest]
         return wp.launch(_wait_kernel(), 1, inputs=inputs, device="cpu", record_cmd=True)
 
     def run(self, jobs: Sequence[Job]) -> None:

@@ -264,6 +264,7 @@ class VectorizedForce:
         team: the threads among which :meth:`add` divides its work.
 
     Attributes:
+        block_count: blocks of rows.
         known: for a material with a direct stress, for each row the sum of 2^k over those of its quadrature points k
             where it held in the last forces computed.
     """
@@ -321,6 +322,7 @@ class VectorizedForce:
         }
         self.known = wp.zeros(len(points) if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
         self._sums = RowSums(points, occupied, dim, dtype, team.size)
+        self.block_count = len(self._sums.chunks)
 
     def _blocked(self, rows: np.ndarray, dtype: type) -> wp.array:
         """Rows (count, ...) as one array with those of a chunk innermost."""

@@ -30,6 +30,10 @@ VECTORIZED_CELLS = 1024
 """Cells of a material, quadratic ones counted by their quadrature points, from which on its forces are computed several
 cells at a time: that takes some seconds to compile once, and work to prepare."""
 
+GRAPH_BLOCKS = 8
+"""Blocks of forces up to which a step on one thread is one graph. That has to be made anew where the length of the step
+changes, which takes 0.3 ms for each block, so that with more of them the forces are a graph of their own."""
+
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
 
@@ -89,7 +93,8 @@ class _Passes:
         self._team = model.team
         self._barrier = Barrier(self._team) if self._team.size > 1 else None
         self._points = share(model.point_count, self._team.size, CHUNK)
-        self._recordings = Recordings()
+        self._as_graphs = not _is_one_graph(model)
+        self._recordings, self._steps = Recordings(), Recordings()
 
     def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
         """Takes the step.
@@ -101,22 +106,37 @@ class _Passes:
             settings: of the move.
         """
         key = (state.u.ptr, state.v.ptr, *settings)
-        work = self._recordings.get(key, lambda: self._record(kick_drift, state, *settings))
+        work = self._steps.get(key, lambda: self._record(kick_drift, state, *settings))
         (self._team if self._barrier is None else self._barrier).run(work)
 
     def _record(self, kick_drift: KickDrift, state: State, *settings: float) -> list[Job]:
+        forces = self._recordings.get((state.u.ptr,), lambda: self._record_forces(state.u))
+        moves = [[kick_drift(state, points, *settings)] for points in self._points]
+        pairs = zip(forces, jobs(moves, SubnormalsFlushed, as_graphs=False), strict=True)
+        return [functools.partial(_in_turn, *pair) for pair in pairs]
+
+    def _record_forces(self, u: wp.array) -> list[Job]:
         launches: list[list[wp.Launch | None]] = [[] for _ in self._points]
         for force in self._forces:
-            for all_own, own in zip(launches, force.record(state.u, self._force), strict=True):
+            for all_own, own in zip(launches, force.record(u, self._force), strict=True):
                 all_own.extend(own)
-        for own, points in zip(launches, self._points, strict=True):
-            if self._barrier is not None:
+        if self._barrier is not None:
+            for own, points in zip(launches, self._points, strict=True):
                 own.append(self._barrier.record())
                 own.extend(force.record_aside(self._force, points) for force in self._forces)
-            own.append(kick_drift(state, points, *settings))
-        return jobs(
-            launches, SubnormalsFlushed, as_graphs=self._team.size > 1
-        )  # on one thread the whole step is a graph
+        return jobs(launches, SubnormalsFlushed, self._as_graphs)
+
+
+def _in_turn(first: Job, second: Job) -> None:
+    first()
+    second()
+
+
+def _is_one_graph(model: Model) -> bool:
+    """Whether a step is one graph, of which no other can be a part: where it is short, and the work of one thread."""
+    forces = [block.vectorized for block in model.blocks if block.vectorized]
+    small = not forces or (model.team.size == 1 and sum(force.block_count for force in forces) <= GRAPH_BLOCKS)
+    return model.device.is_cpu and small
 
 
 class _ExplicitStepper(Stepper):
@@ -139,8 +159,7 @@ class _ExplicitStepper(Stepper):
         if all(block.vectorized for block in model.blocks):
             self._passes = _Passes(model, self._force)
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
-        alone = model.team.size == 1 or not any(block.vectorized for block in model.blocks)  # others share their forces
-        self._as_graph = model.device.is_cpu and alone
+        self._as_graph = _is_one_graph(model)
         self._launched: Hashable = None  # what the last step's launches were made for
         self._graphs = Recordings()
         self._inverse_mass = self._free_inverse_mass()
