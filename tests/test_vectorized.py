@@ -14,6 +14,7 @@ import warpfem as wf
 from warpfem.barrier import Barrier
 from warpfem.linear import tangent_operator
 from warpfem.solvers import explicit, implicit
+from warpfem.solvers.stability import Watch
 from warpfem.strips import STRIP, cut_into_strips
 from warpfem.subnormals import SubnormalsFlushed
 from warpfem.threads import Team, share
@@ -155,6 +156,27 @@ def test_the_stiffness_is_that_of_the_plain_kernel(kind, case):
         expected = plain.assembly.blocks.numpy()
         difference = np.abs(vectorized.assembly.blocks.numpy() - expected).max()
         assert 0.0 < difference <= limit * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("kind", [wf.StableNeoHookean, wf.FixedCorotated])
+def test_the_stability_limit_is_that_of_the_plain_kernel(kind):
+    """Also of cells turned inside out, whose rotation is not known without branches: then all are looked at again."""
+    mesh = MESHES["box"]
+    model = wf.Model(_scene(mesh, kind(E=np.linspace(1e5, 1e6, mesh.cell_count), nu=0.3)), device="cpu")
+    noise = np.random.default_rng(0).normal(size=mesh.points.shape)
+    states = [model.state() for _ in range(3)]
+    for state, size in zip(states, (0.0, 0.03 * mesh.mean_edge_length, 1.0), strict=True):
+        state.assign(displacement=size * noise)
+    plain = Watch(model, states[0])
+    model.vectorize(explicit.VECTORIZED_CELLS)
+    vectorized = Watch(model, states[0])
+    for state in states:
+        expected = plain.stable_dt(state.u)
+        assert vectorized.stable_dt(state.u) == pytest.approx(expected, rel=1e-5)
+        known = vectorized._largest_square(state.u, together=True)
+        assert (known is None) == (kind is wf.FixedCorotated and state is states[2])
+        if known is not None:
+            assert 2.0 / np.sqrt(known) != expected  # equal bits would be those of the plain kernel
 
 
 def test_small_bodies_and_materials_with_branches_keep_the_plain_kernel():

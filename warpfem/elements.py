@@ -29,7 +29,7 @@ from warpfem.tensor import (
     volume_change,
 )
 
-_LARGE = 1e30
+LARGE = 1e30
 """What stands for a squared frequency that is not finite [1/s^2]."""
 
 Filter: TypeAlias = Literal["absolute", "clamped"]
@@ -335,8 +335,8 @@ class ElementKernels:
                 G = stress_differential(H, G, parameters[i]) * Q
                 size = wp.sqrt(wp.ddot(G, G))
             square = (scalar(float(dim + 1)) * scale / density[i]) * size
-            if not (square < scalar(wp.static(_LARGE))):
-                square = scalar(wp.static(_LARGE))
+            if not (square < scalar(wp.static(LARGE))):
+                square = scalar(wp.static(LARGE))
             wp.atomic_max(square_out, 0, square)
 
         return element_frequency
@@ -402,8 +402,8 @@ class ElementKernels:
                 for a in range(wp.static(dim + 1), point_count):
                     p[a] = force[a] / middle_root
                 square = wp.sqrt(wp.ddot(p, p))
-            if not (square < scalar(wp.static(_LARGE))):
-                square = scalar(wp.static(_LARGE))
+            if not (square < scalar(wp.static(LARGE))):
+                square = scalar(wp.static(LARGE))
             wp.atomic_max(square_out, 0, square)
 
         return element_frequency

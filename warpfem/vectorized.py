@@ -30,7 +30,7 @@ from warpfem.threads import Job, Team, share
 from warpfem.vector_code import compiler_flags
 
 
-class _Row:
+class Row:
     """What a row of cells of a shape is.
 
     At a quadrature point of barycentric coordinates lambda, which the cells' corners after the first have, the
@@ -60,10 +60,10 @@ class _Row:
         self.terms = self.points.shape[2]
 
 
-class _Readers:
+class Readers:
     """Kernel functions that read what a row has from blocked arrays."""
 
-    def __init__(self, row: _Row, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
+    def __init__(self, row: Row, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
         t = types(dim, dtype)
         scalar, vector, matrix = t.scalar, t.vector, t.matrix
         parameter_vector = wp.types.vector(length=parameter_count, dtype=scalar)
@@ -103,7 +103,7 @@ class _Readers:
 
 @functools.cache
 def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform: bool) -> wp.Kernel:
-    dim, row = shape.dim, _Row(shape)
+    dim, row = shape.dim, Row(shape)
     t = types(dim, dtype)
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
     width, places, terms = row.width, row.places, row.terms
@@ -111,7 +111,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
     row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
     stress, direct_stress = constitutive.stress, constitutive.direct_stress
     direct = direct_stress is not None
-    read = _Readers(row, constitutive.parameter_count, dim, dtype, uniform)
+    read = Readers(row, constitutive.parameter_count, dim, dtype, uniform)
     read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
 
     @wp.func
@@ -195,14 +195,14 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
 
 @functools.cache
 def _remainder_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform: bool) -> wp.Kernel:
-    dim, row = shape.dim, _Row(shape)
+    dim, row = shape.dim, Row(shape)
     t = types(dim, dtype)
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
     width, places, terms = row.width, row.places, row.terms
     point_table = wp.types.matrix(shape=(places * dim, terms), dtype=wp.int32)(row.points.ravel().tolist())
     weight_table = wp.types.matrix(shape=(places * dim, terms), dtype=scalar)(row.weights.ravel().tolist())
     stress = constitutive.stress
-    read = _Readers(row, constitutive.parameter_count, dim, dtype, uniform)
+    read = Readers(row, constitutive.parameter_count, dim, dtype, uniform)
     read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -264,7 +264,8 @@ class VectorizedForce:
         team: the threads among which :meth:`add` divides its work.
 
     Attributes:
-        block_count: blocks of rows.
+        block_count, chunk_count: blocks and chunks of rows.
+        uniform: whether all cells have the same parameters.
         known: for a material with a direct stress, for each row the sum of 2^k over those of its quadrature points k
             where it held in the last forces computed.
     """
@@ -285,7 +286,7 @@ class VectorizedForce:
         shape = kernels.shape
         dim = self.dim = kernels.dim
         dtype = t.name
-        uniform = len(parameters) == 1
+        self.uniform = uniform = len(parameters) == 1
         made_for = (kernels.constitutive, shape, dtype, uniform)
         self._kernels = [_force_kernel(*made_for)]
         if kernels.constitutive.direct_stress is not None:

@@ -9,6 +9,7 @@ from warpfem.launches import Recordings, jobs
 from warpfem.linear import tangent_operator
 from warpfem.model import CellBlock, Model, State
 from warpfem.solvers.base import require_finite, worst_cell
+from warpfem.solvers.vectorized_frequency import VectorizedFrequency, can_vectorize
 from warpfem.threads import Job, share
 
 POWER_ITERATIONS = 60
@@ -88,6 +89,13 @@ class Watch:
         self.model = model
         density = _cell_densities(model)
         self._densities = [self._device_array(density[block.index]) for block in model.blocks]
+        threads = model.team.size
+        self._vectorized = [
+            VectorizedFrequency(block, float(density[block.index[0]]), threads)
+            if can_vectorize(block, density[block.index])
+            else None
+            for block in model.blocks
+        ]
         # one for each thread: shared, they would lose each other's maxima
         self._squares = wp.zeros(model.team.size, dtype=model.types.scalar, device=model.device)
         self._recordings = Recordings()
@@ -105,22 +113,44 @@ class Watch:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [*self._densities, self._squares]
+        vectorized = [array for own in self._vectorized if own is not None for array in own.arrays()]
+        return [*self._densities, self._squares, *vectorized]
 
     def stable_dt(self, u: wp.array) -> float:
         """The estimate of the largest stable time step [s] at the displacements ``u``."""
         for block in self.model.blocks:
             if block.averaged:
                 block.update_pressure(u)
-        self._squares.zero_()
-        self.model.team.run(self._recordings.get((u.ptr,), lambda: self._record(u)))
-        square = float(self._squares.numpy().max()) + self._contact
+        square = self._largest_square(u, together=True)
+        if square is None:
+            square = self._largest_square(u, together=False)
+            assert square is not None
+        square += self._contact
         return 2.0 / float(np.sqrt(square)) if square > 0.0 else np.inf
 
-    def _record(self, u: wp.array) -> list[Job]:
+    def _largest_square(self, u: wp.array, together: bool) -> float | None:
+        """The largest squared frequency of a cell [1/s^2].
+
+        Args:
+            u: displacements.
+            together: whether several cells are taken at a time where that is possible: ``None`` is returned where that
+                does not tell those of all.
+        """
+        self._squares.zero_()
+        self.model.team.run(self._recordings.get((u.ptr, together), lambda: self._record(u, together)))
+        squares = [own.square() for own in self._vectorized if own is not None] if together else []
+        if any(square is None for square in squares):
+            return None
+        return float(np.max([self._squares.numpy().max(), *squares]))
+
+    def _record(self, u: wp.array, together: bool) -> list[Job]:
         """The launches of the cells' frequencies, divided among threads."""
         launches: list[list[wp.Launch | None]] = [[] for _ in range(len(self._squares))]
-        for block, density in zip(self.model.blocks, self._densities, strict=True):
+        for block, density, vectorized in zip(self.model.blocks, self._densities, self._vectorized, strict=True):
+            if together and vectorized is not None:
+                for thread, own in enumerate(launches):
+                    own.append(vectorized.record(u, thread))
+                continue
             for thread, cells in enumerate(share(block.count, len(launches))):
                 part = slice(cells.start, cells.stop)
                 launches[thread].append(
