@@ -305,7 +305,13 @@ def test_no_price_is_below_what_was_paid_for_less():
     ordered = candidates([point(0.1, 1.0), point(0.05, 1.1), point(0.005, 50.0)], own, "l2")
     assert 1.1 < answer(ordered[:2], own, "l2", 0.01).next_seconds < 50.0
     dear = answer(ordered, own, "l2", 0.01)
-    assert (dear.candidate.seconds, dear.next_seconds) == (50.0, None)
+    assert dear.candidate.seconds == 50.0 < dear.next_seconds
+    cheap, paid = (
+        answer(candidates([*points, point(0.007, last)], own, "l2"), own, "l2", 0.02).next_seconds
+        for points in [[point(0.1, 1.0), point(0.05, 2.0), point(0.02, 5.0)]]
+        for last in (10.0, 100.0)
+    )
+    assert cheap < paid == pytest.approx(10.0 * cheap, rel=0.5)
 
 
 @pytest.mark.parametrize(

@@ -178,9 +178,8 @@ def advice(reference: Reference, name: str) -> str:
 def _extrapolated(edge: Sequence[Candidate], goal: float) -> tuple[float | None, str]:
     """The time at which the front, continued as a power law from its last part, comes to an error [s], or why not.
 
-    Errors that the reference does not resolve follow no power law, and where one of them may be within the goal, others
-    need not be looked for beyond. Nor does the front tell where the power law would be cheaper than what was measured
-    and is not within the goal.
+    Errors that the reference does not resolve follow no power law, but where the last setting has cost more than the
+    law says, so will what is beyond. Where that setting may be within the goal, others need not be looked for.
     """
     if edge[-1].error <= goal:
         return None, f"its last setting may be within {percent(goal)}, but the reference does not resolve that"
@@ -191,10 +190,12 @@ def _extrapolated(edge: Sequence[Candidate], goal: float) -> tuple[float | None,
         return None, "it has too few settings whose errors the reference resolves"
     logs = np.log([[own.error, own.seconds] for own in tail])
     slope, _ = np.polyfit(logs[:, 0], logs[:, 1], 1)
-    seconds = math.exp(logs[-1, 1] + slope * (math.log(goal) - logs[-1, 0]))
-    if not seconds > edge[-1].seconds:
-        return None, f"continued, it would be cheaper than its last setting, which is not within {percent(goal)}"
-    return seconds, ""
+
+    def law(error: float) -> float:
+        return math.exp(logs[-1, 1] + slope * (math.log(error) - logs[-1, 0]))
+
+    last = edge[-1]
+    return law(goal) * max(1.0, last.seconds / law(last.error if last.resolved else last.bound)), ""
 
 
 def percent(value: float) -> str:
