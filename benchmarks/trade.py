@@ -58,6 +58,15 @@ shorter ones, and looks at the limit again and again. Of two axes the later one 
 
 SOLVERS = "solver=backward_euler,sdirk2,velocity_verlet:dt=auto"
 
+LESSONS = (
+    "What to learn: in bodies as soft and on meshes as coarse as these explicit steps are cheap enough to win at all "
+    "of these errors, and below 0.5 % all that is on the fronts is of quadratic cells, which make up for what they "
+    "cost. The error is then that of the mesh, whose order at clamped edges is below two: from 1 % to 0.1 % the price "
+    "grows by about 40 to 50. After an impact it is no more than first order, and no reference that runs in minutes "
+    "tells errors of 1 %."
+)
+"""What the page's figures have in common; to be read again when they are measured again."""
+
 STUDIES = (
     Study(
         "cantilever",
@@ -128,7 +137,7 @@ def page(results: dict[str, dict[str, Any]], plots: str) -> str:
     for study in known:
         cells = [_recommended(answer, results[study.name]["settings"]) for answer in results[study.name]["answers"]]
         lines.append(f"| [{study.name}](#{study.name}) | {' | '.join(cells)} |")
-    lines.append("")
+    lines += ["", *_prose(LESSONS)]
     for study in known:
         lines += _study(study, results[study.name], plots)
     return "\n".join(lines).rstrip() + "\n"
