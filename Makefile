@@ -3,7 +3,7 @@
 # make slow   the long checks too
 # make verify the verification suite, which writes docs/accuracy.md
 # make bench  the benchmarks beside other codes, which write docs/performance.md
-# make trade  the studies of speed against accuracy, which write docs/trade.md, in about 40 minutes on one core
+# make trade  the studies of speed against accuracy, which write docs/trade.md, in about an hour on one core
 # make tuning settings that are found beside the best of sweeps, which write docs/tuning.md
 # make docs   the documentation, in docs/_build
 # make gallery the pictures of the documentation, from the shipped scenes

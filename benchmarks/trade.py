@@ -3,7 +3,7 @@
     python benchmarks/trade.py [--out docs/trade.md] [--folder output/trade] [--scene NAME ...]
 
 Each study is one `warpfem trade` command, which the page names; it goes on from what an earlier run has left in the
-folder. Ten to fifteen minutes for each scene, on an idle machine.
+folder. A quarter to half an hour for each scene, on an idle machine.
 """
 
 import argparse
