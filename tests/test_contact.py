@@ -6,6 +6,7 @@ import warp as wp
 from stepping import EXPLICIT, LINEARISED, MATERIALS, advance, mean, ready, solver_name
 
 from warpfem.boundary import Box, BoxWalls, Plane, Sphere
+from warpfem.contact import DEEP, FLAT, SMALL, STEEP
 from warpfem.errors import SceneError
 from warpfem.materials import LinearElasticity, StableNeoHookean
 from warpfem.mesh import Mesh
@@ -118,17 +119,12 @@ def test_force_and_blocks_are_derivatives_of_the_energy(kind, dim, friction, rng
     np.testing.assert_allclose(force(probe.u), expected, rtol=0, atol=1e-5 * scale)
 
     K = blocks(probe.u)
-    slope = -np.einsum("ikil->ikl", differences(force, probe.u))
-    if kind == "sphere" and not friction:
-        # the curvature of the sphere, k A gap/r (I - n n^T), is negative: dropping it keeps blocks definite
-        y = probe.model.rest_points + probe.u - np.array((0.4, -0.7, 0.5)[:dim])
-        r = np.linalg.norm(y, axis=1)[:, None, None]
-        nn = np.einsum("ik,il->ikl", y, y) / r**2
-        normal_stiffness = np.trace(K, axis1=1, axis2=2)[:, None, None]
-        slope = slope - normal_stiffness * (r - 1.0) / r * (np.eye(dim) - nn)
-    np.testing.assert_allclose(K, slope, rtol=0, atol=2e-5 * np.abs(K).max())
     eigenvalues = np.linalg.eigvalsh(K)
     assert eigenvalues.min() > -1e-12 * eigenvalues.max()
+    if not friction:  # the blocks are those of the normal forces, whatever turns faces and curves surfaces
+        return
+    slope = -np.einsum("ikil->ikl", differences(force, probe.u))
+    np.testing.assert_allclose(K, slope, rtol=0, atol=2e-5 * np.abs(K).max())
 
 
 def test_friction_law_is_smooth_below_the_slip_limit_and_coulombs_above():
@@ -164,10 +160,11 @@ def test_planes_far_from_their_point_keep_their_digits():
     floor = Plane(tuple(point), tuple(normal), stiffness=1e4)
     model, state, _ = ready(Scene([brick(3)], SymplecticEuler(), obstacles=[floor]), "float32")
     state.assign(displacement=np.tile([0.0, -1.0, 0.0], (model.point_count, 1)))
-    surface = model.contact.surface
-    gap = (surface.rest - point + [0.0, -1.0, 0.0]) @ normal
-    expected = np.outer(surface.areas * 1e4 * np.maximum(-gap, 0.0), normal)
-    np.testing.assert_allclose(contact_force(model, state)[surface.host_points], expected, rtol=1e-5, atol=1e-4)
+    near = Plane((0.0, 0.0, 0.0), tuple(normal), stiffness=1e4)
+    same, same_state, _ = ready(Scene([brick(3)], SymplecticEuler(), obstacles=[near]))
+    same_state.assign(displacement=state.displacement)
+    expected = contact_force(same, same_state)
+    np.testing.assert_allclose(contact_force(model, state), expected, rtol=1e-5, atol=1e-4)
 
 
 # ---- rest
@@ -496,27 +493,60 @@ def test_slip_speed_follows_the_scene():
     assert speed() == pytest.approx(1e-3 * size)
 
 
-@pytest.mark.parametrize("mesh", [Mesh.rectangle((3.0, 2.0), (3, 2)), Mesh.box((2.0, 1.0, 1.0), (4, 2, 2))])
-def test_points_bear_with_the_area_of_the_side_that_is_flat(mesh):
-    model = Model(
-        Scene([Body("b", mesh, MATERIALS[mesh.dim])], SymplecticEuler(), obstacles=[plane(mesh.dim)]), dtype="float64"
-    )
-    surface = model.contact.surface
-    area = np.zeros(mesh.point_count)
-    area[surface.host_points] = surface.areas
-    for side in ("left", "right", "bottom", "top"):
-        points = mesh.select_points(side)
-        size = np.delete(np.ptp(mesh.points, axis=0), 0 if side in ("left", "right") else 1)
-        assert area[points].sum() == pytest.approx(np.prod(size))
+def penalty(mesh, x, gap, normals, stiffness, thickness):
+    """The energy of the penalty, and k A of each point where it bears, from the definition."""
+    faces = mesh.boundary_faces
+    corners = x[faces[:, : mesh.dim]]
+    e = corners[:, 1:] - corners[:, :1]
+    area = 0.5 * np.cross(e[:, 0], e[:, 1]) if mesh.dim == 3 else e[:, 0, ::-1] * (1.0, -1.0)
+    size = np.sqrt((area**2).sum(axis=1) + (SMALL * mesh.boundary_face_areas) ** 2)
+    cosine = np.einsum("fi,fji->fj", area / size[:, None], normals[faces])
+    s = np.clip((np.abs(cosine) - STEEP) / (FLAT - STEEP), 0.0, 1.0)
+    c = s * s * (3.0 - 2.0 * s)
+    g = np.maximum(-gap[faces], 0.0)
+    excess = np.maximum(g - DEEP * thickness, 0.0)
+    weight = stiffness * np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares)
+    blocks = np.zeros(len(x))
+    np.add.at(blocks, faces, weight * np.where(excess > 0.0, 1.0, c) * (g > 0.0))
+    return 0.5 * (weight * (c * g**2 + (1.0 - c) * excess**2)).sum(), blocks
 
 
-def test_a_smooth_surface_bears_with_all_of_it():
-    angles = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
-    points = np.vstack([[0.0, 0.0], np.stack([np.cos(angles), np.sin(angles)], axis=1)])
-    i = np.arange(200)
-    disc = Mesh(points, np.stack([np.zeros(200, int), 1 + i, 1 + (i + 1) % 200], axis=1))
-    model = Model(Scene([Body("disc", disc, MATERIALS[2])], SymplecticEuler(), obstacles=[plane(2)]), dtype="float64")
-    np.testing.assert_allclose(model.contact.surface.areas, 2.0 * np.pi / 200, rtol=1e-3)
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_faces_bear_that_lie_along_the_obstacle_whichever_way_a_body_lies(dim, element, rng):
+    body = Body("b", brick(dim, cells=3).mesh, MATERIALS[dim], element=element)
+    model, state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[plane(dim, stiffness=1e4)]))
+    mesh = model.scene.bodies[0].mesh
+    normals = np.tile([0.0, 1.0, 0.0][:dim], (model.point_count, 1))
+    seen = 0
+    for _ in range(12):
+        x = (mesh.points + rng.normal(scale=3e-3, size=mesh.points.shape)) @ np.linalg.qr(rng.normal(size=(dim, dim)))[
+            0
+        ]
+        x[:, 1] -= x[:, 1].min() + rng.uniform(0.05, 0.2)
+        state.assign(displacement=x - mesh.points)
+        energy, stiffness = penalty(mesh, x, x[:, 1], normals, 1e4, 0.125)
+        assert model.contact_energy(state.u) == pytest.approx(energy, rel=1e-10)
+        blocks = wp.zeros(model.point_count, dtype=model.types.matrix, device=model.device)
+        model.contact.add_blocks(state.u, blocks)
+        np.testing.assert_allclose(blocks.numpy()[:, 1, 1], stiffness, rtol=1e-10, atol=1e-9)
+        seen += np.count_nonzero(stiffness)
+    assert seen > 20
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_block_that_has_sunk_in_is_pushed_by_its_base_alone_unless_it_sinks_away(dim):
+    cells = (4, 16) if dim == 2 else (3, 16, 3)
+    mesh = Mesh.rectangle((1.0, 1.0), cells) if dim == 2 else Mesh.box((1.0, 1.0, 1.0), cells)
+    body = Body("b", mesh, MATERIALS[dim])
+    model, state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[plane(dim, stiffness=1e4)]))
+    base = mesh.select_points("bottom")
+    for depth, held in ((0.124, False), (0.2, True)):  # an eighth of its thickness is what it may sink in by itself
+        state.assign(displacement=np.tile([0.0, -depth, 0.0][:dim], (model.point_count, 1)))
+        force = contact_force(model, state)
+        sides = np.delete(force, base, axis=0)
+        assert sides.any() == held
+        assert held or force[base, 1].sum() == pytest.approx(1e4 * depth, rel=1e-12)
 
 
 @pytest.mark.parametrize("solver", STEPS, ids=solver_name)

@@ -1,7 +1,15 @@
 """Contact of boundary points with fixed obstacles: a penalty for depth, and Coulomb friction.
 
-A point at depth g below an obstacle's surface has the energy k A g^2 / 2, where A is the area of the rest
-surface with which the point bears and k the stiffness [Pa/m]; a pressure p therefore rests at the depth p / k.
+A point at depth g below an obstacle's surface has the energy k A g^2 / 2 for its share A of each of its faces, a part
+of the rest surface, that lies along the obstacle's surface; k is the stiffness [Pa/m], so that a pressure p rests at
+the depth p / k. Steep faces, as the sides of a block that has sunk in, bear nothing: with them, meshes so fine that
+they have points within that depth would move in another way than coarser ones. What is deeper than bodies should
+sink in, as where one flows round what holds it, bears with all its faces:
+
+    U = sum over faces and their points of k A (c g^2 + (1 - c) max(g - g_0, 0)^2) / 2,
+
+where c goes from 0 to 1 with the cosine between face and surface, see ``STEEP``, and g_0 is ``DEEP`` of the body's
+thickness. Forces are -dU/dx with all its terms, so that energy is conserved; the stiffness leaves out what turns faces.
 
 In implicit steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact,
 section 5): below ``slip_speed`` it falls off quadratically, so that a point that ought to stick creeps, slower
@@ -20,12 +28,20 @@ import warp as wp
 from warpfem.boundary import Box, BoxWalls, Obstacle, Plane, Sphere
 from warpfem.dtypes import types
 from warpfem.launches import Launcher
-from warpfem.mesh import Mesh
 from warpfem.scene import Body
 
 STOPPING_DEPTH = 0.25
 """Part of a body's thickness within which the default stiffness stops it, from the speed that it starts with and
 gains as it falls."""
+
+STEEP, FLAT = 0.1, 0.7
+"""Cosines between a face and an obstacle's surface up to which the face bears nothing, and from which on all of it."""
+
+SMALL = 0.3
+"""Part of its area at rest at which a face's direction begins to count for less, because it is soon none."""
+
+DEEP = 0.125
+"""Part of a body's thickness from which on steep faces bear, too."""
 
 BOX_STOPPING_DEPTH = 0.125
 """Part of a box's least size within which its default stiffness stops a body: half of the way to its core."""
@@ -47,7 +63,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
 
         @wp.func
         def surface(y: vector, form: vector):
-            return wp.dot(form, y), form
+            return wp.dot(form, y), form, scalar(0.0)
 
     elif kind is Sphere:
         form_type = scalar
@@ -57,9 +73,11 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             distance = wp.length(y)
             normal = vector()
             normal[1] = scalar(1.0)
+            curvature = scalar(0.0)
             if distance > scalar(0.0):
-                normal = y / distance
-            return distance - form, normal
+                curvature = scalar(1.0) / distance
+                normal = curvature * y
+            return distance - form, normal, curvature
 
         @wp.func
         def core_entry(y: vector, p: vector, form: scalar):
@@ -88,7 +106,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
                 if i == 0 or own > gap:
                     gap = own
                     normal = (wp.sign(place[i]) * scale) * row
-            return gap, normal
+            return gap, normal, scalar(0.0)
 
         @wp.func
         def core_entry(y: vector, p: vector, form: matrix):
@@ -119,69 +137,195 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             return (two - slip / limit) / limit, two * (one - slip / limit) / limit
         return one / slip, scalar(0.0)
 
+    if dim == 2:
+
+        @wp.func
+        def area_vector(
+            f: int,
+            faces: wp.array2d(dtype=wp.int32),
+            points: wp.array(dtype=wp.int32),
+            edges: wp.array2d(dtype=vector),
+            u: wp.array(dtype=vector),
+        ):
+            along = edges[f, 0] + (u[points[faces[f, 1]]] - u[points[faces[f, 0]]])
+            rest = edges[f, 0]
+            return vector(along[1], -along[0]), rest, along, along
+
+        @wp.func
+        def add_turn(
+            f: int,
+            faces: wp.array2d(dtype=wp.int32),
+            points: wp.array(dtype=wp.int32),
+            one: vector,
+            other: vector,
+            slope: vector,
+            force_out: wp.array(dtype=vector),
+        ):
+            force = vector(slope[1], -slope[0])
+            force_out[points[faces[f, 1]]] += force
+            force_out[points[faces[f, 0]]] -= force
+
+    else:
+
+        @wp.func
+        def area_vector(
+            f: int,
+            faces: wp.array2d(dtype=wp.int32),
+            points: wp.array(dtype=wp.int32),
+            edges: wp.array2d(dtype=vector),
+            u: wp.array(dtype=vector),
+        ):
+            start = u[points[faces[f, 0]]]
+            one = edges[f, 0] + (u[points[faces[f, 1]]] - start)
+            other = edges[f, 1] + (u[points[faces[f, 2]]] - start)
+            return wp.cross(one, other), wp.cross(edges[f, 0], edges[f, 1]), one, other
+
+        @wp.func
+        def add_turn(
+            f: int,
+            faces: wp.array2d(dtype=wp.int32),
+            points: wp.array(dtype=wp.int32),
+            one: vector,
+            other: vector,
+            slope: vector,
+            force_out: wp.array(dtype=vector),
+        ):
+            first = wp.cross(slope, other)
+            second = wp.cross(one, slope)
+            force_out[points[faces[f, 1]]] += first
+            force_out[points[faces[f, 2]]] += second
+            force_out[points[faces[f, 0]]] -= first + second
+
+    @wp.func
+    def flatness(cosine: scalar):
+        """c and its slope."""
+        width = scalar(FLAT) - scalar(STEEP)
+        s = wp.clamp((wp.abs(cosine) - scalar(STEEP)) / width, scalar(0.0), scalar(1.0))
+        slope = scalar(6.0) * s * (scalar(1.0) - s) / width
+        return s * s * (scalar(3.0) - scalar(2.0) * s), wp.where(cosine < scalar(0.0), -slope, slope)
+
+    @wp.func
+    def direction(area: vector, rest: vector):
+        """That of a face's area vector, less than a unit vector where little of the area at rest is left."""
+        small = scalar(SMALL)
+        inverse = scalar(1.0) / wp.sqrt(wp.length_sq(area) + small * small * wp.length_sq(rest))
+        return inverse * area, inverse
+
     @wp.kernel(module=module, enable_backward=False)
     def friction_limit(
+        faces: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=scalar),
+        edges: wp.array2d(dtype=vector),
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
-        stiffness: wp.array(dtype=scalar),
+        pressure_rate: wp.array(dtype=scalar),
+        deep: wp.array(dtype=scalar),
         form: form_type,
         friction: scalar,
         u: wp.array(dtype=vector),
         magnitude_out: wp.array(dtype=scalar),
         normal_out: wp.array(dtype=vector),
     ):
-        """Writes the largest friction of each point, mu times its normal force, and its normal."""
-        k = wp.tid()
-        gap, normal = surface(origin[k] + u[points[k]], form)
-        magnitude_out[k] = friction * stiffness[k] * wp.max(-gap, scalar(0.0))
-        normal_out[k] = normal
+        """Adds to the largest friction of each point, mu times its normal force; writes its normal."""
+        f = wp.tid()
+        area, rest, _one, _other = area_vector(f, faces, points, edges, u)
+        outward, _inverse = direction(area, rest)
+        for j in range(faces.shape[1]):
+            k = faces[f, j]
+            gap, normal, _curvature = surface(origin[k] + u[points[k]], form)
+            if gap < scalar(0.0):
+                c, _slope = flatness(wp.dot(outward, normal))
+                bearing = -c * gap + (scalar(1.0) - c) * wp.max(-gap - deep[k], scalar(0.0))
+                magnitude_out[k] += friction * pressure_rate[k] * shares[f, j] * bearing
+                normal_out[k] = normal
 
     @wp.kernel(module=module, enable_backward=False)
     def contact_energy(
+        faces: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=scalar),
+        edges: wp.array2d(dtype=vector),
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
-        stiffness: wp.array(dtype=scalar),
+        pressure_rate: wp.array(dtype=scalar),
+        deep: wp.array(dtype=scalar),
         form: form_type,
         u: wp.array(dtype=vector),
         energy_out: wp.array(dtype=wp.float64),
     ):
-        """Adds k A g^2 / 2 to ``energy_out[0]``."""
-        k = wp.tid()
-        gap, _normal = surface(origin[k] + u[points[k]], form)
-        if gap < scalar(0.0):
-            wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * stiffness[k] * gap * gap))
+        """Adds U to ``energy_out[0]``."""
+        f = wp.tid()
+        area, rest, _one, _other = area_vector(f, faces, points, edges, u)
+        outward, _inverse = direction(area, rest)
+        for j in range(faces.shape[1]):
+            k = faces[f, j]
+            gap, normal, _curvature = surface(origin[k] + u[points[k]], form)
+            if gap < scalar(0.0):
+                c, _slope = flatness(wp.dot(outward, normal))
+                excess = wp.max(-gap - deep[k], scalar(0.0))
+                square = c * gap * gap + (scalar(1.0) - c) * excess * excess
+                wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * pressure_rate[k] * shares[f, j] * square))
 
     @wp.kernel(module=module, enable_backward=False)
     def contact_force(
+        faces: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=scalar),
+        edges: wp.array2d(dtype=vector),
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
-        stiffness: wp.array(dtype=scalar),
+        pressure_rate: wp.array(dtype=scalar),
+        deep: wp.array(dtype=scalar),
         form: form_type,
         u: wp.array(dtype=vector),
         force_out: wp.array(dtype=vector),
     ):
-        """Adds the normal forces."""
-        k = wp.tid()
-        i = points[k]
-        gap, normal = surface(origin[k] + u[i], form)
-        if gap < scalar(0.0):
-            force_out[i] += (-stiffness[k] * gap) * normal
+        """Adds -dU/dx: the normal forces, and what turns steep faces."""
+        f = wp.tid()
+        area, rest, one, other = area_vector(f, faces, points, edges, u)
+        outward, inverse = direction(area, rest)
+        slope = vector()
+        for j in range(faces.shape[1]):
+            k = faces[f, j]
+            i = points[k]
+            gap, normal, curvature = surface(origin[k] + u[i], form)
+            if gap < scalar(0.0):
+                cosine = wp.dot(outward, normal)
+                c, change = flatness(cosine)
+                excess = wp.max(-gap - deep[k], scalar(0.0))
+                stiffness = pressure_rate[k] * shares[f, j]
+                bearing = (-c * gap + (scalar(1.0) - c) * excess) * normal
+                if change != scalar(0.0):
+                    turning = scalar(0.5) * (gap * gap - excess * excess) * change
+                    bearing -= (turning * curvature) * (outward - cosine * normal)
+                    slope += (stiffness * turning * inverse) * (normal - cosine * outward)
+                force_out[i] += stiffness * bearing
+        if wp.length_sq(slope) > scalar(0.0):
+            add_turn(f, faces, points, one, other, slope, force_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def contact_blocks(
+        faces: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=scalar),
+        edges: wp.array2d(dtype=vector),
         points: wp.array(dtype=wp.int32),
         origin: wp.array(dtype=vector),
-        stiffness: wp.array(dtype=scalar),
+        pressure_rate: wp.array(dtype=scalar),
+        deep: wp.array(dtype=scalar),
         form: form_type,
         u: wp.array(dtype=vector),
         blocks_out: wp.array(dtype=matrix),
     ):
-        """Adds k A n n^T, the positive semi-definite part of the second derivative, to each point's block."""
-        k = wp.tid()
-        i = points[k]
-        gap, normal = surface(origin[k] + u[i], form)
-        if gap < scalar(0.0):
-            blocks_out[i] += stiffness[k] * wp.outer(normal, normal)
+        """Adds the stiffness of the normal forces along the normals, k A n n^T where a face bears, to the blocks."""
+        f = wp.tid()
+        area, rest, _one, _other = area_vector(f, faces, points, edges, u)
+        outward, _inverse = direction(area, rest)
+        for j in range(faces.shape[1]):
+            k = faces[f, j]
+            i = points[k]
+            gap, normal, _curvature = surface(origin[k] + u[i], form)
+            if gap < scalar(0.0):
+                c, _slope = flatness(wp.dot(outward, normal))
+                part = wp.where(-gap > deep[k], scalar(1.0), c)
+                blocks_out[i] += (pressure_rate[k] * shares[f, j] * part) * wp.outer(normal, normal)
 
     core_limit = None
     if kind is not Plane:
@@ -357,10 +501,15 @@ class _ObstacleContact:
         pressure_rate = default if obstacle.stiffness is None else obstacle.stiffness
         self.form = form
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
-        self.host_stiffness = pressure_rate * surface.areas  # N/m
-        self.stiffness = wp.array(self.host_stiffness, dtype=t.scalar, device=self.device)
+        rates = np.broadcast_to(pressure_rate, self.count)  # Pa/m
+        self.host_stiffness = rates * surface.areas  # N/m
+        self.pressure_rate = wp.array(rates, dtype=t.scalar, device=self.device)
         self._launch = Launcher(self.device)
-        self.normal_arguments = [self.points, self.origin, self.stiffness, form]
+        self._face_count = surface.faces.shape[0]
+        deep = np.minimum(DEEP / STOPPING_DEPTH * surface.stopping_depth, self._deepest(obstacle))
+        self._deep = wp.array(deep, dtype=t.scalar, device=self.device)
+        places = [self.points, self.origin, self.pressure_rate, self._deep]
+        self._surface_arguments = [*surface.face_arrays, *places, form]
         if self.friction > 0.0:
             self.magnitude = wp.zeros(self.count, dtype=t.scalar, device=self.device)
             self.normal = wp.zeros(self.count, dtype=t.vector, device=self.device)
@@ -375,44 +524,44 @@ class _ObstacleContact:
             return (np.abs(places) - 0.5 * np.array(obstacle.size)).max(axis=1)
         return np.linalg.norm(x - np.array(obstacle.center), axis=1) - obstacle.radius
 
+    @staticmethod
+    def _deepest(obstacle: Plane | Sphere | Box) -> float:
+        """Half of the way to the obstacle's core [m], which must not be passed."""
+        if isinstance(obstacle, Plane):
+            return np.inf
+        return 0.25 * obstacle.radius if isinstance(obstacle, Sphere) else BOX_STOPPING_DEPTH * min(obstacle.size)
+
     def depth(self, x: np.ndarray) -> float:
         """The greatest depth of points inside the obstacle [m], negative if all are outside."""
         return float(-self._gap(self.obstacle, x).min())
 
     def arrays(self) -> list[wp.array]:
-        own = [self.origin, self.stiffness]
+        own = [self.origin, self.pressure_rate, self._deep]
         return [*own, self.magnitude, self.normal] if self.friction > 0.0 else own
 
     def launch(self, name: str, inputs: list, outputs: list) -> None:
+        """Launches a kernel for each point."""
         self._launch(getattr(self.kernels, name), self.count, inputs, outputs)
 
+    def launch_faces(self, name: str, inputs: list, outputs: list) -> None:
+        """Launches a kernel of the penalty for each face."""
+        arguments = [*self._surface_arguments, *inputs]
+        self._launch(getattr(self.kernels, name), self._face_count, arguments, outputs)
 
-def _bearing_areas(mesh: Mesh) -> np.ndarray:
-    """The area with which each boundary point bears on an obstacle, (k,) [m^2].
-
-    It is the largest that the point's share of its faces projects to along any of their normals: on a smooth
-    surface the share itself, on the rim of a flat base that of the base without the sides. Faces are shared as mass
-    is: the corners of quadratic ones, to which a uniform pressure gives no force, must bear something too.
-    """
-    shares = np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares).ravel()
-    corners = mesh.boundary_faces.ravel()
-    order = np.argsort(corners, kind="stable")
-    _, starts, counts = np.unique(corners[order], return_index=True, return_counts=True)
-    columns = np.arange(counts.max())
-    slots = order[np.minimum(starts[:, None] + columns, len(order) - 1)]
-    areas = np.where(columns < counts[:, None], shares[slots], 0.0)
-    normals = mesh.boundary_face_normals[slots // mesh.boundary_faces.shape[1]]
-    cosines = np.einsum("kid,kjd->kij", normals, normals)
-    return np.einsum("kij,kj->ki", np.maximum(cosines, 0.0), areas).max(axis=1, where=areas > 0.0, initial=0.0)
+    def limit_friction(self, u: wp.array) -> None:
+        """Takes the friction limits, mu times the normal forces, and the normals at ``u``."""
+        self.magnitude.zero_()
+        self.launch_faces("friction_limit", [self.friction, u], [self.magnitude, self.normal])
 
 
 class ContactSurface:
-    """The boundary points of all bodies with their rest places, areas, initial velocities and default stiffness.
+    """The boundary points of all bodies with their rest places, faces, initial velocities and default stiffness.
 
     ``stopping`` times v^2 + 2 g h is the stiffness [Pa/m] that stops a body within ``STOPPING_DEPTH``, which starts
     towards an obstacle at the speed v and falls on it from the height h: per area, k d^2 / 2 = rho L (v^2 / 2 + g h)
     for a body of thickness L that hits with all its mass; h counts the depth d. ``impedance`` is rho c for P-waves of
-    speed c [kg/(m^2 s)].
+    speed c [kg/(m^2 s)]. ``areas`` are what points have of all their faces [m^2]. Faces are shared as mass is: the
+    corners of quadratic ones, to which a uniform pressure gives no force, must bear something too.
     """
 
     def __init__(
@@ -421,14 +570,23 @@ class ContactSurface:
         starts: Sequence[int],
         p_wave: Sequence[float],
         gravity: Sequence[float] | None,
+        dtype: str,
         device,
     ) -> None:
-        rest, points, areas, stiffness, velocity, stopping, depth, impedance = [], [], [], [], [], [], [], []
+        rest, points, stiffness, velocity, stopping, depth, impedance = [], [], [], [], [], [], []
+        faces, shares, edges, count = [], [], [], 0
+        widest = max(body.mesh.boundary_faces.shape[1] for body in bodies)
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
             mesh = body.mesh
             rest.append(mesh.points[mesh.boundary_points])
             points.append(start + mesh.boundary_points)
-            areas.append(_bearing_areas(mesh))
+            own = np.searchsorted(mesh.boundary_points, mesh.boundary_faces)
+            narrow = ((0, 0), (0, widest - own.shape[1]))
+            faces.append(count + np.pad(own, narrow, mode="edge"))
+            shares.append(np.pad(np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares), narrow))
+            corners = mesh.points[mesh.boundary_faces[:, : mesh.dim]]
+            edges.append(corners[:, 1:] - corners[:, :1])
+            count += len(mesh.boundary_points)
             stiffness.append(np.full(len(mesh.boundary_points), modulus / mesh.mean_edge_length))
             velocity.append(body.initial_velocity()[mesh.boundary_points])
             thickness = float(np.ptp(mesh.bounding_box, axis=0).min())
@@ -442,7 +600,15 @@ class ContactSurface:
         self.rest = np.concatenate(rest)
         self.host_points = np.concatenate(points)
         self.points = wp.array(self.host_points, dtype=wp.int32, device=device)
-        self.areas = np.concatenate(areas)
+        host_faces, host_shares = np.concatenate(faces), np.concatenate(shares)
+        self.areas = np.bincount(host_faces.ravel(), host_shares.ravel())
+        t = types(self.rest.shape[1], dtype)
+        self.faces = wp.array(host_faces, dtype=wp.int32, device=device)
+        self.face_arrays = [
+            self.faces,
+            wp.array(host_shares, dtype=t.scalar, device=device),
+            wp.array(np.concatenate(edges), dtype=t.vector, device=device),
+        ]
         self.stiffness = np.concatenate(stiffness)
         self.velocity = np.concatenate(velocity)
         self.stopping = np.concatenate(stopping)
@@ -498,7 +664,8 @@ class Contact:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [self.surface.points, *(array for part in self.parts for array in part.arrays())]
+        shared = [self.surface.points, *self.surface.face_arrays]
+        return [*shared, *(array for part in self.parts for array in part.arrays())]
 
     def largest_stiffness_over_mass(self, mass: np.ndarray) -> float:
         """An upper bound of the squared angular frequency [1/s^2] that contact adds."""
@@ -512,17 +679,17 @@ class Contact:
     def add_energy(self, u: wp.array, energy_out: wp.array) -> None:
         """Adds the penalty energy to ``energy_out[0]``."""
         for part in self.parts:
-            part.launch("contact_energy", [*part.normal_arguments, u], [energy_out])
+            part.launch_faces("contact_energy", [u], [energy_out])
 
     def add_force(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the normal forces."""
         for part in self.parts:
-            part.launch("contact_force", [*part.normal_arguments, u], [force_out])
+            part.launch_faces("contact_force", [u], [force_out])
 
     def add_blocks(self, u: wp.array, blocks_out: wp.array) -> None:
         """Adds each point's normal stiffness to its d x d block."""
         for part in self.parts:
-            part.launch("contact_blocks", [*part.normal_arguments, u], [blocks_out])
+            part.launch_faces("contact_blocks", [u], [blocks_out])
 
     def limit_step(self, u: wp.array, p: wp.array, limit_out: wp.array) -> None:
         """Lowers ``limit_out[0]`` so far that u + s p takes no point into the core of a sphere or box."""
@@ -534,7 +701,7 @@ class Contact:
     def limit_friction(self, u: wp.array) -> None:
         """Takes the friction limits, mu times the normal forces, and the normals at ``u``."""
         for part in self._rough:
-            part.launch("friction_limit", [*part.normal_arguments, part.friction, u], [part.magnitude, part.normal])
+            part.limit_friction(u)
 
     def linearize_friction(self, u_start: wp.array, dt: float, u_expected: wp.array) -> None:
         """Makes friction a drag that reaches its limit at the slip from ``u_start`` to ``u_expected``.

@@ -384,7 +384,7 @@ class Model:
         from warpfem.contact import Contact, ContactSurface
 
         scene, starts = self.scene, self.point_starts[:-1]
-        surface = ContactSurface(scene.bodies, starts, self._p_wave_moduli(), scene.gravity, self.device)
+        surface = ContactSurface(scene.bodies, starts, self._p_wave_moduli(), scene.gravity, self.dtype, self.device)
         return Contact(self.scene.obstacles, surface, self._slip_speed(), self.dtype)
 
     def _p_wave_moduli(self) -> list[float]:

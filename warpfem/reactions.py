@@ -162,7 +162,7 @@ def _obstacle_forces(model: Model, state: State, places: np.ndarray) -> tuple[Po
         last = first + (len(obstacle.planes()) if isinstance(obstacle, BoxWalls) else 1)
         out.zero_()
         for part in model.contact.parts[first:last]:
-            part.launch("contact_force", [*part.normal_arguments, state.u], [out])
+            part.launch_faces("contact_force", [state.u], [out])
         forces = out.numpy()[points].astype(np.float64)
         result.append(PointForces(_obstacle_name(number, obstacle), points, places[points], forces))
         first = last
