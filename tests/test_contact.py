@@ -113,12 +113,12 @@ def test_force_and_blocks_are_derivatives_of_the_energy(kind, dim, friction, rng
     probe = Probe(kind, dim, rng)
     energy, force, blocks = probe.terms(friction)
     expected = -differences(energy, probe.u)
-    touching = np.linalg.norm(expected, axis=1) > 0.0
+    K = blocks(probe.u)
+    touching = K.any(axis=(1, 2))
     assert 0 < np.count_nonzero(touching) < len(touching)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(force(probe.u), expected, rtol=0, atol=1e-5 * scale)
 
-    K = blocks(probe.u)
     eigenvalues = np.linalg.eigvalsh(K)
     assert eigenvalues.min() > -1e-12 * eigenvalues.max()
     if not friction:  # the blocks are those of the normal forces, whatever turns faces and curves surfaces
@@ -204,12 +204,12 @@ def test_a_resting_body_sinks_by_pressure_over_stiffness(dim):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_default_stiffness_is_the_p_wave_modulus_over_the_edge_length(dim):
     model, state, _ = ready(Scene([brick(dim)], SymplecticEuler(), obstacles=[plane(dim)]))
-    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.01, 0.0][:dim]))
+    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.003, 0.0][:dim]))
     body = model.scene.bodies[0]
     moduli = body.material.moduli
     modulus = moduli.lam + 2.0 * moduli.mu
-    # a base of area 1 at depth 0.01 m: the sides do not count on its rim
-    expected = 0.01 * modulus / body.mesh.mean_edge_length
+    # a base of area 1 at depth 0.003 m: the sides do not count on its rim
+    expected = 0.003 * modulus / body.mesh.mean_edge_length
     assert contact_force(model, state)[:, 1].sum() == pytest.approx(expected, rel=1e-12)
 
 
@@ -217,8 +217,8 @@ def test_default_stiffness_is_the_p_wave_modulus_over_the_edge_length(dim):
 def test_default_stiffness_stops_a_thrown_body_within_a_quarter_of_its_thickness(dim):
     thrown = brick(dim, stiffness_of_body=1e5, velocity=(0.0, -100.0, 0.0)[:dim])
     model, state, stepper = ready(Scene([thrown], BackwardEuler(), obstacles=[plane(dim)]))
-    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.01, 0.0][:dim]))
-    expected = 0.01 * 1000.0 * 100.0**2 / (0.25**2 * 0.125)  # force on the base of area 1: k depth
+    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.003, 0.0][:dim]))
+    expected = 0.003 * 1000.0 * 100.0**2 / (0.25**2 * 0.125)  # force on the base of area 1: k depth
     assert contact_force(model, state)[:, 1].sum() == pytest.approx(expected, rel=1e-12)
     state.assign(displacement=np.zeros((model.point_count, dim)))
     depths = []
@@ -500,8 +500,9 @@ def penalty(mesh, x, gap, normals, stiffness, thickness):
     e = corners[:, 1:] - corners[:, :1]
     area = 0.5 * np.cross(e[:, 0], e[:, 1]) if mesh.dim == 3 else e[:, 0, ::-1] * (1.0, -1.0)
     size = np.sqrt((area**2).sum(axis=1) + (SMALL * mesh.boundary_face_areas) ** 2)
-    cosine = np.einsum("fi,fji->fj", area / size[:, None], normals[faces])
-    s = np.clip((np.abs(cosine) - STEEP) / (FLAT - STEEP), 0.0, 1.0)
+    outward = area / size[:, None]
+    squared_sine = (outward**2).sum(axis=1)[:, None] - np.einsum("fi,fji->fj", outward, normals[faces]) ** 2
+    s = np.clip((STEEP - squared_sine) / (STEEP - FLAT), 0.0, 1.0)
     c = s * s * (3.0 - 2.0 * s)
     g = np.maximum(-gap[faces], 0.0)
     excess = np.maximum(g - DEEP * thickness, 0.0)
@@ -514,7 +515,7 @@ def penalty(mesh, x, gap, normals, stiffness, thickness):
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_faces_bear_that_lie_along_the_obstacle_whichever_way_a_body_lies(dim, element, rng):
-    body = Body("b", brick(dim, cells=3).mesh, MATERIALS[dim], element=element)
+    body = Body("b", brick(dim, cells=3).mesh, StableNeoHookean(E=1e6, nu=0.3), element=element)
     model, state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[plane(dim, stiffness=1e4)]))
     mesh = model.scene.bodies[0].mesh
     normals = np.tile([0.0, 1.0, 0.0][:dim], (model.point_count, 1))
@@ -536,12 +537,12 @@ def test_faces_bear_that_lie_along_the_obstacle_whichever_way_a_body_lies(dim, e
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_block_that_has_sunk_in_is_pushed_by_its_base_alone_unless_it_sinks_away(dim):
-    cells = (4, 16) if dim == 2 else (3, 16, 3)
+    cells = (4, 40) if dim == 2 else (2, 40, 2)
     mesh = Mesh.rectangle((1.0, 1.0), cells) if dim == 2 else Mesh.box((1.0, 1.0, 1.0), cells)
     body = Body("b", mesh, MATERIALS[dim])
     model, state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[plane(dim, stiffness=1e4)]))
     base = mesh.select_points("bottom")
-    for depth, held in ((0.124, False), (0.2, True)):  # an eighth of its thickness is what it may sink in by itself
+    for depth, held in ((0.029, False), (0.1, True)):  # 3 % of its thickness is what it may always sink in
         state.assign(displacement=np.tile([0.0, -depth, 0.0][:dim], (model.point_count, 1)))
         force = contact_force(model, state)
         sides = np.delete(force, base, axis=0)

@@ -8,8 +8,9 @@ sink in, as where one flows round what holds it, bears with all its faces:
 
     U = sum over faces and their points of k A (c g^2 + (1 - c) max(g - g_0, 0)^2) / 2,
 
-where c goes from 0 to 1 with the cosine between face and surface, see ``STEEP``, and g_0 is ``DEEP`` of the body's
-thickness. Forces are -dU/dx with all its terms, so that energy is conserved; the stiffness leaves out what turns faces.
+where c goes from 1 to 0 with the angle between face and surface, see ``STEEP``, and g_0 is how deep a body is expected
+to sink in. Forces are -dU/dx with all its terms, so that energy is conserved; the stiffness leaves out what turns
+faces. Those of linear elasticity, which knows small strains alone, keep their directions at rest.
 
 In implicit steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact,
 section 5): below ``slip_speed`` it falls off quadratically, so that a point that ought to stick creeps, slower
@@ -34,17 +35,51 @@ STOPPING_DEPTH = 0.25
 """Part of a body's thickness within which the default stiffness stops it, from the speed that it starts with and
 gains as it falls."""
 
-STEEP, FLAT = 0.1, 0.7
-"""Cosines between a face and an obstacle's surface up to which the face bears nothing, and from which on all of it."""
+FLAT, STEEP = 0.5, 0.93
+"""Squared sines of the angle between a face and an obstacle's surface up to which all of the face bears, and from which
+on nothing: 46 and 80 degrees, with ``SMALL``."""
 
-SMALL = 0.3
-"""Part of its area at rest at which a face's direction begins to count for less, because it is soon none."""
+SMALL = 0.2
+"""Part of its area at rest at which a face is taken for less steep than it is: when little is left of it, it has no
+direction to speak of, and bears."""
 
-DEEP = 0.125
-"""Part of a body's thickness from which on steep faces bear, too."""
+DEEP = 0.03
+"""Part of a body's thickness that it may always sink in before its steep faces bear, too."""
 
 BOX_STOPPING_DEPTH = 0.125
 """Part of a box's least size within which its default stiffness stops a body: half of the way to its core."""
+
+
+@functools.cache
+def place_type(dim: int, dtype: str) -> type:
+    """The structure by which kernels find the boundary faces and points, and what each has of one obstacle."""
+    t = types(dim, dtype)
+
+    @wp.struct
+    class Places:
+        """The boundary as one obstacle meets it.
+
+        Attributes:
+            faces: (f, j) the boundary points of each face.
+            shares: (f, j) what they have of its area [m^2].
+            edges: (f, dim - 1) its edges from the first corner at rest [m].
+            turns: (f,) 1, or 0 where a face keeps its direction at rest.
+            points: (k,) the points of the model that the boundary points are.
+            origin: (k,) their places at rest from the obstacle's [m].
+            pressure_rate: (k,) the stiffness [Pa/m].
+            deep: (k,) from which depth on steep faces bear [m].
+        """
+
+        faces: wp.array2d(dtype=wp.int32)
+        shares: wp.array2d(dtype=t.scalar)
+        edges: wp.array2d(dtype=t.vector)
+        turns: wp.array(dtype=t.scalar)
+        points: wp.array(dtype=wp.int32)
+        origin: wp.array(dtype=t.vector)
+        pressure_rate: wp.array(dtype=t.scalar)
+        deep: wp.array(dtype=t.scalar)
+
+    return Places
 
 
 @functools.cache
@@ -56,6 +91,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
     """
     t = types(dim, dtype)
     vector, matrix, scalar = t.vector, t.matrix, t.scalar
+    places = place_type(dim, dtype)
     module = f"warpfem.contact_{kind.__name__.lower()}_{dim}_{dtype}"
 
     if kind is Plane:
@@ -140,69 +176,35 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
     if dim == 2:
 
         @wp.func
-        def area_vector(
-            f: int,
-            faces: wp.array2d(dtype=wp.int32),
-            points: wp.array(dtype=wp.int32),
-            edges: wp.array2d(dtype=vector),
-            u: wp.array(dtype=vector),
-        ):
-            along = edges[f, 0] + (u[points[faces[f, 1]]] - u[points[faces[f, 0]]])
-            rest = edges[f, 0]
+        def area_vector(f: int, at: places, u: wp.array(dtype=vector)):
+            """A face's area vector now, a vector of its length at rest, and the edges from its first corner."""
+            rest = at.edges[f, 0]
+            along = rest + at.turns[f] * (u[at.points[at.faces[f, 1]]] - u[at.points[at.faces[f, 0]]])
             return vector(along[1], -along[0]), rest, along, along
 
         @wp.func
-        def add_turn(
-            f: int,
-            faces: wp.array2d(dtype=wp.int32),
-            points: wp.array(dtype=wp.int32),
-            one: vector,
-            other: vector,
-            slope: vector,
-            force_out: wp.array(dtype=vector),
-        ):
+        def turn(f: int, at: places, one: vector, other: vector, slope: vector, force_out: wp.array(dtype=vector)):
+            """Adds the forces on the corners of a face for the slope of its energy in its area vector."""
             force = vector(slope[1], -slope[0])
-            force_out[points[faces[f, 1]]] += force
-            force_out[points[faces[f, 0]]] -= force
+            force_out[at.points[at.faces[f, 1]]] += force
+            force_out[at.points[at.faces[f, 0]]] -= force
 
     else:
 
         @wp.func
-        def area_vector(
-            f: int,
-            faces: wp.array2d(dtype=wp.int32),
-            points: wp.array(dtype=wp.int32),
-            edges: wp.array2d(dtype=vector),
-            u: wp.array(dtype=vector),
-        ):
-            start = u[points[faces[f, 0]]]
-            one = edges[f, 0] + (u[points[faces[f, 1]]] - start)
-            other = edges[f, 1] + (u[points[faces[f, 2]]] - start)
-            return wp.cross(one, other), wp.cross(edges[f, 0], edges[f, 1]), one, other
+        def area_vector(f: int, at: places, u: wp.array(dtype=vector)):
+            start = u[at.points[at.faces[f, 0]]]
+            one = at.edges[f, 0] + at.turns[f] * (u[at.points[at.faces[f, 1]]] - start)
+            other = at.edges[f, 1] + at.turns[f] * (u[at.points[at.faces[f, 2]]] - start)
+            return wp.cross(one, other), wp.cross(at.edges[f, 0], at.edges[f, 1]), one, other
 
         @wp.func
-        def add_turn(
-            f: int,
-            faces: wp.array2d(dtype=wp.int32),
-            points: wp.array(dtype=wp.int32),
-            one: vector,
-            other: vector,
-            slope: vector,
-            force_out: wp.array(dtype=vector),
-        ):
+        def turn(f: int, at: places, one: vector, other: vector, slope: vector, force_out: wp.array(dtype=vector)):
             first = wp.cross(slope, other)
             second = wp.cross(one, slope)
-            force_out[points[faces[f, 1]]] += first
-            force_out[points[faces[f, 2]]] += second
-            force_out[points[faces[f, 0]]] -= first + second
-
-    @wp.func
-    def flatness(cosine: scalar):
-        """c and its slope."""
-        width = scalar(FLAT) - scalar(STEEP)
-        s = wp.clamp((wp.abs(cosine) - scalar(STEEP)) / width, scalar(0.0), scalar(1.0))
-        slope = scalar(6.0) * s * (scalar(1.0) - s) / width
-        return s * s * (scalar(3.0) - scalar(2.0) * s), wp.where(cosine < scalar(0.0), -slope, slope)
+            force_out[at.points[at.faces[f, 1]]] += first
+            force_out[at.points[at.faces[f, 2]]] += second
+            force_out[at.points[at.faces[f, 0]]] -= first + second
 
     @wp.func
     def direction(area: vector, rest: vector):
@@ -211,15 +213,18 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         inverse = scalar(1.0) / wp.sqrt(wp.length_sq(area) + small * small * wp.length_sq(rest))
         return inverse * area, inverse
 
+    @wp.func
+    def flatness(outward: vector, normal: vector):
+        """c, and its slope in the squared sine."""
+        across = wp.dot(outward, normal)
+        width = scalar(STEEP) - scalar(FLAT)
+        s = (scalar(STEEP) - (wp.length_sq(outward) - across * across)) / width
+        s = wp.clamp(s, scalar(0.0), scalar(1.0))
+        return s * s * (scalar(3.0) - scalar(2.0) * s), scalar(-6.0) * s * (scalar(1.0) - s) / width
+
     @wp.kernel(module=module, enable_backward=False)
     def friction_limit(
-        faces: wp.array2d(dtype=wp.int32),
-        shares: wp.array2d(dtype=scalar),
-        edges: wp.array2d(dtype=vector),
-        points: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=vector),
-        pressure_rate: wp.array(dtype=scalar),
-        deep: wp.array(dtype=scalar),
+        at: places,
         form: form_type,
         friction: scalar,
         u: wp.array(dtype=vector),
@@ -228,104 +233,87 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
     ):
         """Adds to the largest friction of each point, mu times its normal force; writes its normal."""
         f = wp.tid()
-        area, rest, _one, _other = area_vector(f, faces, points, edges, u)
+        area, rest, _one, _other = area_vector(f, at, u)
         outward, _inverse = direction(area, rest)
-        for j in range(faces.shape[1]):
-            k = faces[f, j]
-            gap, normal, _curvature = surface(origin[k] + u[points[k]], form)
+        for j in range(at.faces.shape[1]):
+            k = at.faces[f, j]
+            gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
             if gap < scalar(0.0):
-                c, _slope = flatness(wp.dot(outward, normal))
-                bearing = -c * gap + (scalar(1.0) - c) * wp.max(-gap - deep[k], scalar(0.0))
-                magnitude_out[k] += friction * pressure_rate[k] * shares[f, j] * bearing
+                c, _slope = flatness(outward, normal)
+                bearing = -c * gap + (scalar(1.0) - c) * wp.max(-gap - at.deep[k], scalar(0.0))
+                magnitude_out[k] += friction * at.pressure_rate[k] * at.shares[f, j] * bearing
                 normal_out[k] = normal
 
     @wp.kernel(module=module, enable_backward=False)
     def contact_energy(
-        faces: wp.array2d(dtype=wp.int32),
-        shares: wp.array2d(dtype=scalar),
-        edges: wp.array2d(dtype=vector),
-        points: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=vector),
-        pressure_rate: wp.array(dtype=scalar),
-        deep: wp.array(dtype=scalar),
+        at: places,
         form: form_type,
         u: wp.array(dtype=vector),
         energy_out: wp.array(dtype=wp.float64),
     ):
         """Adds U to ``energy_out[0]``."""
         f = wp.tid()
-        area, rest, _one, _other = area_vector(f, faces, points, edges, u)
+        area, rest, _one, _other = area_vector(f, at, u)
         outward, _inverse = direction(area, rest)
-        for j in range(faces.shape[1]):
-            k = faces[f, j]
-            gap, normal, _curvature = surface(origin[k] + u[points[k]], form)
+        for j in range(at.faces.shape[1]):
+            k = at.faces[f, j]
+            gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
             if gap < scalar(0.0):
-                c, _slope = flatness(wp.dot(outward, normal))
-                excess = wp.max(-gap - deep[k], scalar(0.0))
+                c, _slope = flatness(outward, normal)
+                excess = wp.max(-gap - at.deep[k], scalar(0.0))
                 square = c * gap * gap + (scalar(1.0) - c) * excess * excess
-                wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * pressure_rate[k] * shares[f, j] * square))
+                wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * at.pressure_rate[k] * at.shares[f, j] * square))
 
     @wp.kernel(module=module, enable_backward=False)
     def contact_force(
-        faces: wp.array2d(dtype=wp.int32),
-        shares: wp.array2d(dtype=scalar),
-        edges: wp.array2d(dtype=vector),
-        points: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=vector),
-        pressure_rate: wp.array(dtype=scalar),
-        deep: wp.array(dtype=scalar),
+        at: places,
         form: form_type,
         u: wp.array(dtype=vector),
         force_out: wp.array(dtype=vector),
     ):
         """Adds -dU/dx: the normal forces, and what turns steep faces."""
         f = wp.tid()
-        area, rest, one, other = area_vector(f, faces, points, edges, u)
+        area, rest, one, other = area_vector(f, at, u)
         outward, inverse = direction(area, rest)
         slope = vector()
-        for j in range(faces.shape[1]):
-            k = faces[f, j]
-            i = points[k]
-            gap, normal, curvature = surface(origin[k] + u[i], form)
+        for j in range(at.faces.shape[1]):
+            k = at.faces[f, j]
+            i = at.points[k]
+            gap, normal, curvature = surface(at.origin[k] + u[i], form)
             if gap < scalar(0.0):
-                cosine = wp.dot(outward, normal)
-                c, change = flatness(cosine)
-                excess = wp.max(-gap - deep[k], scalar(0.0))
-                stiffness = pressure_rate[k] * shares[f, j]
+                c, change = flatness(outward, normal)
+                excess = wp.max(-gap - at.deep[k], scalar(0.0))
+                stiffness = at.pressure_rate[k] * at.shares[f, j]
                 bearing = (-c * gap + (scalar(1.0) - c) * excess) * normal
                 if change != scalar(0.0):
-                    turning = scalar(0.5) * (gap * gap - excess * excess) * change
-                    bearing -= (turning * curvature) * (outward - cosine * normal)
-                    slope += (stiffness * turning * inverse) * (normal - cosine * outward)
+                    turning = (gap * gap - excess * excess) * change
+                    across = wp.dot(outward, normal)
+                    along = outward - across * normal
+                    bearing += (turning * curvature * across) * along
+                    slope += (at.turns[f] * stiffness * turning * inverse) * (along - wp.length_sq(along) * outward)
                 force_out[i] += stiffness * bearing
         if wp.length_sq(slope) > scalar(0.0):
-            add_turn(f, faces, points, one, other, slope, force_out)
+            turn(f, at, one, other, slope, force_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def contact_blocks(
-        faces: wp.array2d(dtype=wp.int32),
-        shares: wp.array2d(dtype=scalar),
-        edges: wp.array2d(dtype=vector),
-        points: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=vector),
-        pressure_rate: wp.array(dtype=scalar),
-        deep: wp.array(dtype=scalar),
+        at: places,
         form: form_type,
         u: wp.array(dtype=vector),
         blocks_out: wp.array(dtype=matrix),
     ):
         """Adds the stiffness of the normal forces along the normals, k A n n^T where a face bears, to the blocks."""
         f = wp.tid()
-        area, rest, _one, _other = area_vector(f, faces, points, edges, u)
+        area, rest, _one, _other = area_vector(f, at, u)
         outward, _inverse = direction(area, rest)
-        for j in range(faces.shape[1]):
-            k = faces[f, j]
-            i = points[k]
-            gap, normal, _curvature = surface(origin[k] + u[i], form)
+        for j in range(at.faces.shape[1]):
+            k = at.faces[f, j]
+            i = at.points[k]
+            gap, normal, _curvature = surface(at.origin[k] + u[i], form)
             if gap < scalar(0.0):
-                c, _slope = flatness(wp.dot(outward, normal))
-                part = wp.where(-gap > deep[k], scalar(1.0), c)
-                blocks_out[i] += (pressure_rate[k] * shares[f, j] * part) * wp.outer(normal, normal)
+                c, _slope = flatness(outward, normal)
+                part = wp.where(-gap > at.deep[k], scalar(1.0), c)
+                blocks_out[i] += (at.pressure_rate[k] * at.shares[f, j] * part) * wp.outer(normal, normal)
 
     core_limit = None
     if kind is not Plane:
@@ -476,7 +464,7 @@ class _ObstacleContact:
         self.friction = obstacle.friction
         self.device = surface.device
         self.count = len(surface.rest)
-        self.points = surface.points
+        self.points = surface.arrays["points"]
         if isinstance(obstacle, Plane):
             form: wp.vec3 | wp.mat33 | float = t.vector(*obstacle.normal)
             n = np.array(obstacle.normal)
@@ -495,9 +483,10 @@ class _ObstacleContact:
         approach = np.maximum(-(surface.velocity * outward).sum(axis=1), 0.0)
         height = np.maximum(self._gap(obstacle, surface.rest), 0.0) + surface.stopping_depth
         fall = np.maximum(-(surface.gravity * outward).sum(axis=-1), 0.0) * height
-        default = np.maximum(surface.stiffness, surface.stopping * (approach**2 + 2.0 * fall))
+        speed = np.sqrt(approach**2 + 2.0 * fall)
+        default = np.maximum(surface.stiffness, surface.stopping * speed**2)
         if isinstance(obstacle, Box):
-            default = np.maximum(default, surface.box_stiffness(obstacle, outward, np.sqrt(approach**2 + 2.0 * fall)))
+            default = np.maximum(default, surface.box_stiffness(obstacle, outward, speed))
         pressure_rate = default if obstacle.stiffness is None else obstacle.stiffness
         self.form = form
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
@@ -505,11 +494,16 @@ class _ObstacleContact:
         self.host_stiffness = rates * surface.areas  # N/m
         self.pressure_rate = wp.array(rates, dtype=t.scalar, device=self.device)
         self._launch = Launcher(self.device)
-        self._face_count = surface.faces.shape[0]
-        deep = np.minimum(DEEP / STOPPING_DEPTH * surface.stopping_depth, self._deepest(obstacle))
+        self._face_count = surface.arrays["faces"].shape[0]
+        expected = np.maximum(
+            surface.expected_depth(rates, outward, speed), DEEP / STOPPING_DEPTH * surface.stopping_depth
+        )
+        deep = np.minimum(expected, self._deepest(obstacle))
         self._deep = wp.array(deep, dtype=t.scalar, device=self.device)
-        places = [self.points, self.origin, self.pressure_rate, self._deep]
-        self._surface_arguments = [*surface.face_arrays, *places, form]
+        self._places = place_type(dim, dtype)()
+        for name, array in surface.arrays.items():
+            setattr(self._places, name, array)
+        self._places.origin, self._places.pressure_rate, self._places.deep = self.origin, self.pressure_rate, self._deep
         if self.friction > 0.0:
             self.magnitude = wp.zeros(self.count, dtype=t.scalar, device=self.device)
             self.normal = wp.zeros(self.count, dtype=t.vector, device=self.device)
@@ -545,7 +539,7 @@ class _ObstacleContact:
 
     def launch_faces(self, name: str, inputs: list, outputs: list) -> None:
         """Launches a kernel of the penalty for each face."""
-        arguments = [*self._surface_arguments, *inputs]
+        arguments = [self._places, self.form, *inputs]
         self._launch(getattr(self.kernels, name), self._face_count, arguments, outputs)
 
     def limit_friction(self, u: wp.array) -> None:
@@ -561,7 +555,8 @@ class ContactSurface:
     towards an obstacle at the speed v and falls on it from the height h: per area, k d^2 / 2 = rho L (v^2 / 2 + g h)
     for a body of thickness L that hits with all its mass; h counts the depth d. ``impedance`` is rho c for P-waves of
     speed c [kg/(m^2 s)]. ``areas`` are what points have of all their faces [m^2]. Faces are shared as mass is: the
-    corners of quadratic ones, to which a uniform pressure gives no force, must bear something too.
+    corners of quadratic ones, to which a uniform pressure gives no force, must bear something too. ``arrays`` are those
+    of kernels' :func:`place_type` that all obstacles have in common.
     """
 
     def __init__(
@@ -574,7 +569,7 @@ class ContactSurface:
         device,
     ) -> None:
         rest, points, stiffness, velocity, stopping, depth, impedance = [], [], [], [], [], [], []
-        faces, shares, edges, count = [], [], [], 0
+        faces, shares, edges, turns, count = [], [], [], [], 0
         widest = max(body.mesh.boundary_faces.shape[1] for body in bodies)
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
             mesh = body.mesh
@@ -586,6 +581,7 @@ class ContactSurface:
             shares.append(np.pad(np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares), narrow))
             corners = mesh.points[mesh.boundary_faces[:, : mesh.dim]]
             edges.append(corners[:, 1:] - corners[:, :1])
+            turns.append(np.full(len(own), 0.0 if body.material.constitutive.small_strain else 1.0))
             count += len(mesh.boundary_points)
             stiffness.append(np.full(len(mesh.boundary_points), modulus / mesh.mean_edge_length))
             velocity.append(body.initial_velocity()[mesh.boundary_points])
@@ -599,16 +595,16 @@ class ContactSurface:
         self.stopping_depth = np.concatenate(depth)
         self.rest = np.concatenate(rest)
         self.host_points = np.concatenate(points)
-        self.points = wp.array(self.host_points, dtype=wp.int32, device=device)
         host_faces, host_shares = np.concatenate(faces), np.concatenate(shares)
         self.areas = np.bincount(host_faces.ravel(), host_shares.ravel())
         t = types(self.rest.shape[1], dtype)
-        self.faces = wp.array(host_faces, dtype=wp.int32, device=device)
-        self.face_arrays = [
-            self.faces,
-            wp.array(host_shares, dtype=t.scalar, device=device),
-            wp.array(np.concatenate(edges), dtype=t.vector, device=device),
-        ]
+        self.arrays = {
+            "faces": wp.array(host_faces, dtype=wp.int32, device=device),
+            "shares": wp.array(host_shares, dtype=t.scalar, device=device),
+            "edges": wp.array(np.concatenate(edges), dtype=t.vector, device=device),
+            "turns": wp.array(np.concatenate(turns), dtype=t.scalar, device=device),
+            "points": wp.array(self.host_points, dtype=wp.int32, device=device),
+        }
         self.stiffness = np.concatenate(stiffness)
         self.velocity = np.concatenate(velocity)
         self.stopping = np.concatenate(stopping)
@@ -626,10 +622,22 @@ class ContactSurface:
             speed: (k,) with which they meet it [m/s].
         """
         depth = BOX_STOPPING_DEPTH * min(box.size)
-        inertia = self.stopping * self.stopping_depth**2  # rho L
-        weight = inertia * np.maximum(-(self.gravity * outward).sum(axis=1), 0.0)
-        rigid = inertia * speed**2 / depth**2
-        return np.minimum(rigid, self.impedance * speed / depth) + 2.0 * weight / depth
+        rigid = self._inertia * speed**2 / depth**2
+        return np.minimum(rigid, self.impedance * speed / depth) + 2.0 * self._weight(outward) / depth
+
+    def expected_depth(self, stiffness: np.ndarray, outward: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """How deep points sink into an obstacle of a stiffness (k,) [Pa/m], as :meth:`box_stiffness` has it [m]."""
+        rigid = speed * np.sqrt(self._inertia / stiffness)
+        return np.minimum(rigid, self.impedance * speed / stiffness) + 2.0 * self._weight(outward) / stiffness
+
+    @property
+    def _inertia(self) -> np.ndarray:
+        """rho L [kg/m^2]."""
+        return self.stopping * self.stopping_depth**2
+
+    def _weight(self, outward: np.ndarray) -> np.ndarray:
+        """rho g L towards an obstacle [Pa]."""
+        return self._inertia * np.maximum(-(self.gravity * outward).sum(axis=-1), 0.0)
 
 
 class Contact:
@@ -664,8 +672,7 @@ class Contact:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        shared = [self.surface.points, *self.surface.face_arrays]
-        return [*shared, *(array for part in self.parts for array in part.arrays())]
+        return [*self.surface.arrays.values(), *(array for part in self.parts for array in part.arrays())]
 
     def largest_stiffness_over_mass(self, mass: np.ndarray) -> float:
         """An upper bound of the squared angular frequency [1/s^2] that contact adds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -78,10 +79,10 @@ def _draw(axes: Any, own: Sweep) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     bottom, top = axes.get_ylim()
-    if own.reference is not None:
-        band = own.reference.band(own.name)
+    band = 0.0 if own.reference is None else own.reference.band(own.name)
+    if band > 0.0:
         axes.axhspan(min(bottom, 0.5 * band), band, color="0.85", zorder=-1)
-        axes.text(0.99, band, "the reference is no better than this", ha="right", va="top", transform=_across(axes))
+        axes.text(0.01, band, "the reference is no better than this", va="top", transform=_across(axes))
         bottom = min(bottom, 0.5 * band)
     for target in (answer.target for answer in own.answers):
         if bottom < target < top:
@@ -94,7 +95,8 @@ def _draw(axes: Any, own: Sweep) -> None:
     axes.set_xlabel(f"wall time of the steps [s]: median and range of the processes{load}")
     axes.set_ylabel(f"relative error of {label(own.name)}")
     axes.set_title(f"{Path(own.study.problem.path).stem}: time against error")
-    _legend(axes, own, colored, marked)
+    # where nothing is as fast and as accurate, above the band
+    _legend(axes, own, colored, marked, low=math.log(max(band, bottom) / bottom, top / bottom))
 
 
 def _styled(own: Sweep) -> tuple[str, str]:
@@ -123,7 +125,7 @@ def _across(axes: Any) -> Any:
     return axes.get_yaxis_transform()
 
 
-def _legend(axes: Any, own: Sweep, colored: str, marked: str) -> None:
+def _legend(axes: Any, own: Sweep, colored: str, marked: str, low: float) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
@@ -135,7 +137,7 @@ def _legend(axes: Any, own: Sweep, colored: str, marked: str) -> None:
         for value, marker in zip(_values(own, marked), MARKERS, strict=False)
     ]
     handles.append(Line2D([], [], color="0.3", label="the front"))
-    axes.legend(handles=handles, fontsize="small", loc="best")
+    axes.legend(handles=handles, fontsize="small", loc="lower left", bbox_to_anchor=(0.0, low))
 
 
 def _list(axes: Any, own: Sweep) -> None:
