@@ -59,7 +59,8 @@ class Probe:
 
     def __init__(self, kind, dim, rng):
         obstacle = OBSTACLES[kind](dim, friction=0.4, stiffness=1e4)
-        self.model, self.state, _ = ready(Scene([brick(dim, cells=2)], SymplecticEuler(), obstacles=[obstacle]))
+        body = Body("brick", brick(dim, cells=2).mesh, StableNeoHookean(E=1e6, nu=0.3))
+        self.model, self.state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[obstacle]))
         self.contact = self.model.contact
         self.shape = (self.model.point_count, dim)
         self.u = rng.normal(scale=0.05, size=self.shape)
@@ -533,6 +534,16 @@ def test_faces_bear_that_lie_along_the_obstacle_whichever_way_a_body_lies(dim, e
         np.testing.assert_allclose(blocks.numpy()[:, 1, 1], stiffness, rtol=1e-10, atol=1e-9)
         seen += np.count_nonzero(stiffness)
     assert seen > 20
+
+
+def test_faces_of_linear_elasticity_keep_their_directions_at_rest():
+    for material, bears in ((LinearElasticity(E=1e6, nu=0.3), True), (StableNeoHookean(E=1e6, nu=0.3), False)):
+        body = Body("b", Mesh.rectangle((1.0, 1.0), (1, 1)), material)
+        model, state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[plane(2, stiffness=1e4)]))
+        x = body.mesh.points
+        steep = np.stack([0.1 * x[:, 0], x[:, 1] - x[:, 0]], axis=1)  # the base stands nearly upright
+        state.assign(displacement=steep - x - [0.0, -0.985])
+        assert (np.abs(contact_force(model, state)).max() > 1.0) == bears
 
 
 @pytest.mark.parametrize("dim", [2, 3])
