@@ -4,7 +4,8 @@ Physics: stable Neo-Hookean elasticity, gravity, penalty contact with Coulomb fr
 Units: SI. A 1 m cube of 1000 kg/m^3 at E = 1e5 Pa (gelatine) falls from 0.3 m.
 Tested: at rest the floor carries the weight, so that the mean depth of the bottom, weighted by area, is
 rho g H / k with the contact stiffness k [Pa/m], within 2 %. Where meshes are compared, the floor wants a k of its own,
-such as 4e6: by default it goes with the cells.
+such as 4e5: by default it goes with the cells. Floors that are much stiffer send waves through the body that only very
+fine meshes follow.
 """
 
 import warpfem as wf
