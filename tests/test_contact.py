@@ -6,7 +6,7 @@ import warp as wp
 from stepping import EXPLICIT, LINEARISED, MATERIALS, advance, mean, ready, solver_name
 
 from warpfem.boundary import Box, BoxWalls, Plane, Sphere
-from warpfem.contact import DEEP, FLAT, SMALL, STEEP
+from warpfem.contact import FLAT, SMALL, SPARED, STEEP
 from warpfem.errors import SceneError
 from warpfem.materials import LinearElasticity, StableNeoHookean
 from warpfem.mesh import Mesh
@@ -205,12 +205,12 @@ def test_a_resting_body_sinks_by_pressure_over_stiffness(dim):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_default_stiffness_is_the_p_wave_modulus_over_the_edge_length(dim):
     model, state, _ = ready(Scene([brick(dim)], SymplecticEuler(), obstacles=[plane(dim)]))
-    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.003, 0.0][:dim]))
+    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.001, 0.0][:dim]))
     body = model.scene.bodies[0]
     moduli = body.material.moduli
     modulus = moduli.lam + 2.0 * moduli.mu
-    # a base of area 1 at depth 0.003 m: the sides do not count on its rim
-    expected = 0.003 * modulus / body.mesh.mean_edge_length
+    # a base of area 1 at depth 0.001 m: the sides do not count on its rim
+    expected = 0.001 * modulus / body.mesh.mean_edge_length
     assert contact_force(model, state)[:, 1].sum() == pytest.approx(expected, rel=1e-12)
 
 
@@ -218,8 +218,8 @@ def test_default_stiffness_is_the_p_wave_modulus_over_the_edge_length(dim):
 def test_default_stiffness_stops_a_thrown_body_within_a_quarter_of_its_thickness(dim):
     thrown = brick(dim, stiffness_of_body=1e5, velocity=(0.0, -100.0, 0.0)[:dim])
     model, state, stepper = ready(Scene([thrown], BackwardEuler(), obstacles=[plane(dim)]))
-    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.003, 0.0][:dim]))
-    expected = 0.003 * 1000.0 * 100.0**2 / (0.25**2 * 0.125)  # force on the base of area 1: k depth
+    state.assign(displacement=np.full((model.point_count, dim), [0.0, -0.001, 0.0][:dim]))
+    expected = 0.001 * 1000.0 * 100.0**2 / (0.25**2 * 0.125)  # force on the base of area 1: k depth
     assert contact_force(model, state)[:, 1].sum() == pytest.approx(expected, rel=1e-12)
     state.assign(displacement=np.zeros((model.point_count, dim)))
     depths = []
@@ -494,7 +494,13 @@ def test_slip_speed_follows_the_scene():
     assert speed() == pytest.approx(1e-3 * size)
 
 
-def penalty(mesh, x, gap, normals, stiffness, thickness):
+def spared_depth(body, stiffness):
+    """g_0 [m]."""
+    moduli = body.material.moduli
+    return np.sqrt(SPARED * (moduli.lam + 2.0 * moduli.mu) * body.mesh.mean_edge_length / stiffness)
+
+
+def penalty(mesh, x, gap, normals, stiffness, deep):
     """The energy of the penalty, and k A of each point where it bears, from the definition."""
     faces = mesh.boundary_faces
     corners = x[faces[:, : mesh.dim]]
@@ -506,11 +512,13 @@ def penalty(mesh, x, gap, normals, stiffness, thickness):
     s = np.clip((STEEP - squared_sine) / (STEEP - FLAT), 0.0, 1.0)
     c = s * s * (3.0 - 2.0 * s)
     g = np.maximum(-gap[faces], 0.0)
-    excess = np.maximum(g - DEEP * thickness, 0.0)
+    first = np.where(g > deep, 2.0 * (g - deep) ** 2, 0.0)
+    square = np.where(g > 2.0 * deep, g**2 - 2.0 * deep**2, first)
+    rate = np.select([g > 2.0 * deep, g > deep], [1.0, 2.0], 0.0)
     weight = stiffness * np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares)
     blocks = np.zeros(len(x))
-    np.add.at(blocks, faces, weight * np.where(excess > 0.0, 1.0, c) * (g > 0.0))
-    return 0.5 * (weight * (c * g**2 + (1.0 - c) * excess**2)).sum(), blocks
+    np.add.at(blocks, faces, weight * (c + (1.0 - c) * rate) * (g > 0.0))
+    return 0.5 * (weight * (c * g**2 + (1.0 - c) * square)).sum(), blocks
 
 
 @pytest.mark.parametrize("element", ["linear", "quadratic"])
@@ -527,7 +535,7 @@ def test_faces_bear_that_lie_along_the_obstacle_whichever_way_a_body_lies(dim, e
         ]
         x[:, 1] -= x[:, 1].min() + rng.uniform(0.05, 0.2)
         state.assign(displacement=x - mesh.points)
-        energy, stiffness = penalty(mesh, x, x[:, 1], normals, 1e4, 0.125)
+        energy, stiffness = penalty(mesh, x, x[:, 1], normals, 1e4, spared_depth(body, 1e4))
         assert model.contact_energy(state.u) == pytest.approx(energy, rel=1e-10)
         blocks = wp.zeros(model.point_count, dtype=model.types.matrix, device=model.device)
         model.contact.add_blocks(state.u, blocks)
@@ -551,14 +559,15 @@ def test_a_block_that_has_sunk_in_is_pushed_by_its_base_alone_unless_it_sinks_aw
     cells = (4, 40) if dim == 2 else (2, 40, 2)
     mesh = Mesh.rectangle((1.0, 1.0), cells) if dim == 2 else Mesh.box((1.0, 1.0, 1.0), cells)
     body = Body("b", mesh, MATERIALS[dim])
-    model, state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[plane(dim, stiffness=1e4)]))
+    stiffness = spared_depth(body, 1.0) ** 2 / 0.1**2  # for which it is 0.1 m
+    model, state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[plane(dim, stiffness=stiffness)]))
     base = mesh.select_points("bottom")
-    for depth, held in ((0.029, False), (0.1, True)):  # 3 % of its thickness is what it may always sink in
+    for depth, held in ((0.099, False), (0.2, True)):
         state.assign(displacement=np.tile([0.0, -depth, 0.0][:dim], (model.point_count, 1)))
         force = contact_force(model, state)
         sides = np.delete(force, base, axis=0)
         assert sides.any() == held
-        assert held or force[base, 1].sum() == pytest.approx(1e4 * depth, rel=1e-12)
+        assert held or force[base, 1].sum() == pytest.approx(stiffness * depth, rel=1e-12)
 
 
 @pytest.mark.parametrize("solver", STEPS, ids=solver_name)

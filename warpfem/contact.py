@@ -3,13 +3,14 @@
 A point at depth g below an obstacle's surface has the energy k A g^2 / 2 for its share A of each of its faces, a part
 of the rest surface, that lies along the obstacle's surface; k is the stiffness [Pa/m], so that a pressure p rests at
 the depth p / k. Steep faces, as the sides of a block that has sunk in, bear nothing: with them, meshes so fine that
-they have points within that depth would move in another way than coarser ones. What is deeper than bodies should
-sink in, as where one flows round what holds it, bears with all its faces:
+they have points within that depth would move in another way than coarser ones. What is much deeper, as where a body
+too soft to stand flows round what holds it, bears with all its faces:
 
-    U = sum over faces and their points of k A (c g^2 + (1 - c) max(g - g_0, 0)^2) / 2,
+    U = sum over faces and their points of k A (c g^2 + (1 - c) s(g)) / 2,
 
-where c goes from 1 to 0 with the angle between face and surface, see ``STEEP``, and g_0 is how deep a body is expected
-to sink in. Forces are -dU/dx with all its terms, so that energy is conserved; the stiffness leaves out what turns
+where c goes from 1 to 0 with the angle between face and surface, see ``STEEP``, and s from 0 by 2 (g - g_0)^2 to
+g^2 - 2 g_0^2, from 2 g_0 on; g_0 is such that faces are not turned away from an obstacle by what they would be spared,
+see ``SPARED``. Forces are -dU/dx with all its terms, so that energy is conserved; the stiffness leaves out what turns
 faces. Those of linear elasticity, which knows small strains alone, keep their directions at rest.
 
 In implicit steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact,
@@ -43,8 +44,9 @@ SMALL = 0.2
 """Part of its area at rest at which a face is taken for less steep than it is: when little is left of it, it has no
 direction to speak of, and bears."""
 
-DEEP = 0.03
-"""Part of a body's thickness that it may always sink in before its steep faces bear, too."""
+SPARED = 0.5
+"""The most energy that a face is spared by being steep, k g_0^2 per area, over what deforms the body there, its P-wave
+modulus times the size of its cells: with more of it, surfaces that are pressed on deeply would wrinkle."""
 
 BOX_STOPPING_DEPTH = 0.125
 """Part of a box's least size within which its default stiffness stops a body: half of the way to its core."""
@@ -67,7 +69,7 @@ def place_type(dim: int, dtype: str) -> type:
             points: (k,) the points of the model that the boundary points are.
             origin: (k,) their places at rest from the obstacle's [m].
             pressure_rate: (k,) the stiffness [Pa/m].
-            deep: (k,) from which depth on steep faces bear [m].
+            deep: (k,) g_0 [m].
         """
 
         faces: wp.array2d(dtype=wp.int32)
@@ -222,6 +224,16 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         s = wp.clamp(s, scalar(0.0), scalar(1.0))
         return s * s * (scalar(3.0) - scalar(2.0) * s), scalar(-6.0) * s * (scalar(1.0) - s) / width
 
+    @wp.func
+    def steep_square(g: scalar, deep: scalar):
+        """s(g), half its slope, and half its curvature."""
+        two = scalar(2.0)
+        if g <= deep:
+            return scalar(0.0), scalar(0.0), scalar(0.0)
+        if g < two * deep:
+            return two * (g - deep) * (g - deep), two * (g - deep), two
+        return g * g - two * deep * deep, g, scalar(1.0)
+
     @wp.kernel(module=module, enable_backward=False)
     def friction_limit(
         at: places,
@@ -239,8 +251,9 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             k = at.faces[f, j]
             gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
             if gap < scalar(0.0):
-                c, _slope = flatness(outward, normal)
-                bearing = -c * gap + (scalar(1.0) - c) * wp.max(-gap - at.deep[k], scalar(0.0))
+                c, _change = flatness(outward, normal)
+                _square, steep, _rate = steep_square(-gap, at.deep[k])
+                bearing = -c * gap + (scalar(1.0) - c) * steep
                 magnitude_out[k] += friction * at.pressure_rate[k] * at.shares[f, j] * bearing
                 normal_out[k] = normal
 
@@ -259,9 +272,9 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             k = at.faces[f, j]
             gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
             if gap < scalar(0.0):
-                c, _slope = flatness(outward, normal)
-                excess = wp.max(-gap - at.deep[k], scalar(0.0))
-                square = c * gap * gap + (scalar(1.0) - c) * excess * excess
+                c, _change = flatness(outward, normal)
+                steep, _slope, _rate = steep_square(-gap, at.deep[k])
+                square = c * gap * gap + (scalar(1.0) - c) * steep
                 wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * at.pressure_rate[k] * at.shares[f, j] * square))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -282,11 +295,11 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             gap, normal, curvature = surface(at.origin[k] + u[i], form)
             if gap < scalar(0.0):
                 c, change = flatness(outward, normal)
-                excess = wp.max(-gap - at.deep[k], scalar(0.0))
+                square, steep, _rate = steep_square(-gap, at.deep[k])
                 stiffness = at.pressure_rate[k] * at.shares[f, j]
-                bearing = (-c * gap + (scalar(1.0) - c) * excess) * normal
+                bearing = (-c * gap + (scalar(1.0) - c) * steep) * normal
                 if change != scalar(0.0):
-                    turning = (gap * gap - excess * excess) * change
+                    turning = (gap * gap - square) * change
                     across = wp.dot(outward, normal)
                     along = outward - across * normal
                     bearing += (turning * curvature * across) * along
@@ -311,8 +324,9 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             i = at.points[k]
             gap, normal, _curvature = surface(at.origin[k] + u[i], form)
             if gap < scalar(0.0):
-                c, _slope = flatness(outward, normal)
-                part = wp.where(-gap > at.deep[k], scalar(1.0), c)
+                c, _change = flatness(outward, normal)
+                _square, _steep, rate = steep_square(-gap, at.deep[k])
+                part = c + (scalar(1.0) - c) * rate
                 blocks_out[i] += (at.pressure_rate[k] * at.shares[f, j] * part) * wp.outer(normal, normal)
 
     core_limit = None
@@ -491,14 +505,11 @@ class _ObstacleContact:
         self.form = form
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
         rates = np.broadcast_to(pressure_rate, self.count)  # Pa/m
-        self.host_stiffness = rates * surface.areas  # N/m
+        self.host_stiffness = 2.0 * rates * surface.areas  # N/m, where faces are steep twice what they are at last
         self.pressure_rate = wp.array(rates, dtype=t.scalar, device=self.device)
         self._launch = Launcher(self.device)
         self._face_count = surface.arrays["faces"].shape[0]
-        expected = np.maximum(
-            surface.expected_depth(rates, outward, speed), DEEP / STOPPING_DEPTH * surface.stopping_depth
-        )
-        deep = np.minimum(expected, self._deepest(obstacle))
+        deep = np.sqrt(SPARED * surface.resistance / rates)
         self._deep = wp.array(deep, dtype=t.scalar, device=self.device)
         self._places = place_type(dim, dtype)()
         for name, array in surface.arrays.items():
@@ -517,13 +528,6 @@ class _ObstacleContact:
             places = (x - np.array(obstacle.center)) @ np.array(obstacle.axes).T
             return (np.abs(places) - 0.5 * np.array(obstacle.size)).max(axis=1)
         return np.linalg.norm(x - np.array(obstacle.center), axis=1) - obstacle.radius
-
-    @staticmethod
-    def _deepest(obstacle: Plane | Sphere | Box) -> float:
-        """Half of the way to the obstacle's core [m], which must not be passed."""
-        if isinstance(obstacle, Plane):
-            return np.inf
-        return 0.25 * obstacle.radius if isinstance(obstacle, Sphere) else BOX_STOPPING_DEPTH * min(obstacle.size)
 
     def depth(self, x: np.ndarray) -> float:
         """The greatest depth of points inside the obstacle [m], negative if all are outside."""
@@ -554,9 +558,10 @@ class ContactSurface:
     ``stopping`` times v^2 + 2 g h is the stiffness [Pa/m] that stops a body within ``STOPPING_DEPTH``, which starts
     towards an obstacle at the speed v and falls on it from the height h: per area, k d^2 / 2 = rho L (v^2 / 2 + g h)
     for a body of thickness L that hits with all its mass; h counts the depth d. ``impedance`` is rho c for P-waves of
-    speed c [kg/(m^2 s)]. ``areas`` are what points have of all their faces [m^2]. Faces are shared as mass is: the
-    corners of quadratic ones, to which a uniform pressure gives no force, must bear something too. ``arrays`` are those
-    of kernels' :func:`place_type` that all obstacles have in common.
+    speed c [kg/(m^2 s)], ``resistance`` their modulus times the size of cells [N/m]. ``areas`` are what points have of
+    all their faces [m^2]. Faces are shared as mass is: the corners of quadratic ones, to which a uniform pressure gives
+    no force, must bear something too. ``arrays`` are those of kernels' :func:`place_type` that all obstacles have in
+    common.
     """
 
     def __init__(
@@ -568,7 +573,7 @@ class ContactSurface:
         dtype: str,
         device,
     ) -> None:
-        rest, points, stiffness, velocity, stopping, depth, impedance = [], [], [], [], [], [], []
+        rest, points, stiffness, resistance, velocity, stopping, depth, impedance = [], [], [], [], [], [], [], []
         faces, shares, edges, turns, count = [], [], [], [], 0
         widest = max(body.mesh.boundary_faces.shape[1] for body in bodies)
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
@@ -584,6 +589,7 @@ class ContactSurface:
             turns.append(np.full(len(own), 0.0 if body.material.constitutive.small_strain else 1.0))
             count += len(mesh.boundary_points)
             stiffness.append(np.full(len(mesh.boundary_points), modulus / mesh.mean_edge_length))
+            resistance.append(np.full(len(mesh.boundary_points), modulus * mesh.mean_edge_length))
             velocity.append(body.initial_velocity()[mesh.boundary_points])
             thickness = float(np.ptp(mesh.bounding_box, axis=0).min())
             inertia = np.max(body.density) / (STOPPING_DEPTH**2 * thickness)
@@ -606,6 +612,7 @@ class ContactSurface:
             "points": wp.array(self.host_points, dtype=wp.int32, device=device),
         }
         self.stiffness = np.concatenate(stiffness)
+        self.resistance = np.concatenate(resistance)
         self.velocity = np.concatenate(velocity)
         self.stopping = np.concatenate(stopping)
         self.impedance = np.concatenate(impedance)
@@ -622,22 +629,10 @@ class ContactSurface:
             speed: (k,) with which they meet it [m/s].
         """
         depth = BOX_STOPPING_DEPTH * min(box.size)
-        rigid = self._inertia * speed**2 / depth**2
-        return np.minimum(rigid, self.impedance * speed / depth) + 2.0 * self._weight(outward) / depth
-
-    def expected_depth(self, stiffness: np.ndarray, outward: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """How deep points sink into an obstacle of a stiffness (k,) [Pa/m], as :meth:`box_stiffness` has it [m]."""
-        rigid = speed * np.sqrt(self._inertia / stiffness)
-        return np.minimum(rigid, self.impedance * speed / stiffness) + 2.0 * self._weight(outward) / stiffness
-
-    @property
-    def _inertia(self) -> np.ndarray:
-        """rho L [kg/m^2]."""
-        return self.stopping * self.stopping_depth**2
-
-    def _weight(self, outward: np.ndarray) -> np.ndarray:
-        """rho g L towards an obstacle [Pa]."""
-        return self._inertia * np.maximum(-(self.gravity * outward).sum(axis=-1), 0.0)
+        inertia = self.stopping * self.stopping_depth**2  # rho L
+        weight = inertia * np.maximum(-(self.gravity * outward).sum(axis=1), 0.0)
+        rigid = inertia * speed**2 / depth**2
+        return np.minimum(rigid, self.impedance * speed / depth) + 2.0 * weight / depth
 
 
 class Contact:
