@@ -54,12 +54,18 @@ OBSTACLES = {
 }
 
 
+def spared_depth(body, stiffness):
+    """g_0 [m]."""
+    moduli = body.material.moduli
+    return np.sqrt(SPARED * (moduli.lam + 2.0 * moduli.mu) * body.mesh.mean_edge_length / stiffness)
+
+
 class Probe:
     """The contact of a body that dips into an obstacle, evaluated at any displacement."""
 
-    def __init__(self, kind, dim, rng):
+    def __init__(self, kind, dim, rng, E=1e6, element="linear"):
         obstacle = OBSTACLES[kind](dim, friction=0.4, stiffness=1e4)
-        body = Body("brick", brick(dim, cells=2).mesh, StableNeoHookean(E=1e6, nu=0.3))
+        body = Body("brick", brick(dim, cells=2).mesh, StableNeoHookean(E=E, nu=0.3), element=element)
         self.model, self.state, _ = ready(Scene([body], SymplecticEuler(), obstacles=[obstacle]))
         self.contact = self.model.contact
         self.shape = (self.model.point_count, dim)
@@ -126,6 +132,31 @@ def test_force_and_blocks_are_derivatives_of_the_energy(kind, dim, friction, rng
         return
     slope = -np.einsum("ikil->ikl", differences(force, probe.u))
     np.testing.assert_allclose(K, slope, rtol=0, atol=2e-5 * np.abs(K).max())
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", OBSTACLES)
+def test_forces_on_steep_faces_that_are_deep_are_derivatives_of_the_energy(kind, dim, element, rng):
+    probe = Probe(kind, dim, rng, E=40.0, element=element)
+    limit = spared_depth(probe.model.scene.bodies[0], 1e4)
+    depth = probe.contact.depth(probe.u)
+    assert depth > 2.0 * limit
+    energy, force, _ = probe.terms(friction=False)
+    expected = -differences(energy, probe.u)
+    np.testing.assert_allclose(force(probe.u), expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_energy_of_a_point_that_slides_round_the_edge_of_a_box_does_not_jump(dim):
+    mesh = Mesh.rectangle((1.0, 0.2), (4, 1)) if dim == 2 else Mesh.box((1.0, 0.2, 1.0), (4, 1, 4))
+    box = Box((0.5, -0.5, 0.5)[:dim], (1.0, 1.0, 1.0)[:dim], stiffness=1e4)
+    model, state, _ = ready(Scene([Body("b", mesh, MATERIALS[dim])], SymplecticEuler(), obstacles=[box]))
+    energies = []
+    for x in np.linspace(0.0, 0.4, 401):
+        state.assign(displacement=np.tile([x, -0.1, 0.0][:dim], (model.point_count, 1)))
+        energies.append(model.contact_energy(state.u))
+    assert np.abs(np.diff(energies)).max() < 0.02 * max(energies)
 
 
 def test_friction_law_is_smooth_below_the_slip_limit_and_coulombs_above():
@@ -492,12 +523,6 @@ def test_slip_speed_follows_the_scene():
     size = np.hypot(1.0, 0.125)
     assert speed(gravity=(0.0, -G)) == pytest.approx(1e-3 * np.sqrt(G * size))
     assert speed() == pytest.approx(1e-3 * size)
-
-
-def spared_depth(body, stiffness):
-    """g_0 [m]."""
-    moduli = body.material.moduli
-    return np.sqrt(SPARED * (moduli.lam + 2.0 * moduli.mu) * body.mesh.mean_edge_length / stiffness)
 
 
 def penalty(mesh, x, gap, normals, stiffness, deep):

@@ -138,7 +138,8 @@ class Plane(_Obstacle):
         friction: Coulomb coefficient, >= 0.
         stiffness: pressure per depth of penetration [Pa/m]; ``None`` takes the body's P-wave modulus
             over its mean edge length, or what stops the body, from the speed at which it starts and falls towards the
-            plane, within a quarter of its thickness, if that is more.
+            plane, within a quarter of its thickness, if that is more. Faces that are steep to the plane bear nothing
+            down to about the size of a cell, on softer planes further down.
     """
 
     point: Vector

@@ -8,10 +8,11 @@ too soft to stand flows round what holds it, bears with all its faces:
 
     U = sum over faces and their points of k A (c g^2 + (1 - c) s(g)) / 2,
 
-where c goes from 1 to 0 with the angle between face and surface, see ``STEEP``, and s from 0 by 2 (g - g_0)^2 to
-g^2 - 2 g_0^2, from 2 g_0 on; g_0 is such that faces are not turned away from an obstacle by what they would be spared,
-see ``SPARED``. Forces are -dU/dx with all its terms, so that energy is conserved; the stiffness leaves out what turns
-faces. Those of linear elasticity, which knows small strains alone, keep their directions at rest.
+where c goes from 1 to 0 with the angle between face and surface, see ``STEEP``, and s(g) is 0 up to g_0, 2 (g - g_0)^2
+up to 2 g_0, and g^2 - 2 g_0^2 beyond; g_0 is such that surfaces do not wrinkle, see ``SPARED``. Forces are -dU/dx with
+all its terms, so that energy is conserved; the stiffness leaves out what turns faces. Faces of bodies of linear
+elasticity, which knows small strains alone, keep their directions at rest. On a :class:`Box`, whose surface has edges
+where its direction jumps, all faces bear, c = 1.
 
 In implicit steps friction is the smoothed Coulomb law of Li et al. 2020 (Incremental Potential Contact,
 section 5): below ``slip_speed`` it falls off quadratically, so that a point that ought to stick creeps, slower
@@ -41,12 +42,13 @@ FLAT, STEEP = 0.5, 0.93
 on nothing: 46 and 80 degrees, with ``SMALL``."""
 
 SMALL = 0.2
-"""Part of its area at rest at which a face is taken for less steep than it is: when little is left of it, it has no
-direction to speak of, and bears."""
+"""Part of its area at rest below which a face has no direction to speak of: an upright one begins to bear below 0.7 of
+its area, and does so fully at 0.2."""
 
 SPARED = 0.5
-"""The most energy that a face is spared by being steep, k g_0^2 per area, over what deforms the body there, its P-wave
-modulus times the size of its cells: with more of it, surfaces that are pressed on deeply would wrinkle."""
+"""The most energy that a face would save by standing upright, k g_0^2 per area, over what deforms the body there, its
+P-wave modulus times the size of its cells (the largest and the mean of a body): with more of it, surfaces that are
+pressed on deeply would wrinkle."""
 
 BOX_STOPPING_DEPTH = 0.125
 """Part of a box's least size within which its default stiffness stops a body: half of the way to its core."""
@@ -65,21 +67,21 @@ def place_type(dim: int, dtype: str) -> type:
             faces: (f, j) the boundary points of each face.
             shares: (f, j) what they have of its area [m^2].
             edges: (f, dim - 1) its edges from the first corner at rest [m].
-            turns: (f,) 1, or 0 where a face keeps its direction at rest.
+            follows: (f,) 1, or 0 where a face keeps its direction at rest.
             points: (k,) the points of the model that the boundary points are.
             origin: (k,) their places at rest from the obstacle's [m].
             pressure_rate: (k,) the stiffness [Pa/m].
-            deep: (k,) g_0 [m].
+            spared_depth: (k,) g_0 [m].
         """
 
         faces: wp.array2d(dtype=wp.int32)
         shares: wp.array2d(dtype=t.scalar)
         edges: wp.array2d(dtype=t.vector)
-        turns: wp.array(dtype=t.scalar)
+        follows: wp.array(dtype=t.scalar)
         points: wp.array(dtype=wp.int32)
         origin: wp.array(dtype=t.vector)
         pressure_rate: wp.array(dtype=t.scalar)
-        deep: wp.array(dtype=t.scalar)
+        spared_depth: wp.array(dtype=t.scalar)
 
     return Places
 
@@ -181,7 +183,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         def area_vector(f: int, at: places, u: wp.array(dtype=vector)):
             """A face's area vector now, a vector of its length at rest, and the edges from its first corner."""
             rest = at.edges[f, 0]
-            along = rest + at.turns[f] * (u[at.points[at.faces[f, 1]]] - u[at.points[at.faces[f, 0]]])
+            along = rest + at.follows[f] * (u[at.points[at.faces[f, 1]]] - u[at.points[at.faces[f, 0]]])
             return vector(along[1], -along[0]), rest, along, along
 
         @wp.func
@@ -196,8 +198,8 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         @wp.func
         def area_vector(f: int, at: places, u: wp.array(dtype=vector)):
             start = u[at.points[at.faces[f, 0]]]
-            one = at.edges[f, 0] + at.turns[f] * (u[at.points[at.faces[f, 1]]] - start)
-            other = at.edges[f, 1] + at.turns[f] * (u[at.points[at.faces[f, 2]]] - start)
+            one = at.edges[f, 0] + at.follows[f] * (u[at.points[at.faces[f, 1]]] - start)
+            other = at.edges[f, 1] + at.follows[f] * (u[at.points[at.faces[f, 2]]] - start)
             return wp.cross(one, other), wp.cross(at.edges[f, 0], at.edges[f, 1]), one, other
 
         @wp.func
@@ -215,14 +217,22 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         inverse = scalar(1.0) / wp.sqrt(wp.length_sq(area) + small * small * wp.length_sq(rest))
         return inverse * area, inverse
 
-    @wp.func
-    def flatness(outward: vector, normal: vector):
-        """c, and its slope in the squared sine."""
-        across = wp.dot(outward, normal)
-        width = scalar(STEEP) - scalar(FLAT)
-        s = (scalar(STEEP) - (wp.length_sq(outward) - across * across)) / width
-        s = wp.clamp(s, scalar(0.0), scalar(1.0))
-        return s * s * (scalar(3.0) - scalar(2.0) * s), scalar(-6.0) * s * (scalar(1.0) - s) / width
+    if kind is Box:
+
+        @wp.func
+        def flatness(outward: vector, normal: vector):
+            return scalar(1.0), scalar(0.0)
+
+    else:
+
+        @wp.func
+        def flatness(outward: vector, normal: vector):
+            """c, and its slope in the squared sine."""
+            across = wp.dot(outward, normal)
+            width = scalar(STEEP) - scalar(FLAT)
+            s = (scalar(STEEP) - (wp.length_sq(outward) - across * across)) / width
+            s = wp.clamp(s, scalar(0.0), scalar(1.0))
+            return s * s * (scalar(3.0) - scalar(2.0) * s), scalar(-6.0) * s * (scalar(1.0) - s) / width
 
     @wp.func
     def steep_square(g: scalar, deep: scalar):
@@ -252,7 +262,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
             if gap < scalar(0.0):
                 c, _change = flatness(outward, normal)
-                _square, steep, _rate = steep_square(-gap, at.deep[k])
+                _square, steep, _rate = steep_square(-gap, at.spared_depth[k])
                 bearing = -c * gap + (scalar(1.0) - c) * steep
                 magnitude_out[k] += friction * at.pressure_rate[k] * at.shares[f, j] * bearing
                 normal_out[k] = normal
@@ -273,8 +283,8 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
             if gap < scalar(0.0):
                 c, _change = flatness(outward, normal)
-                steep, _slope, _rate = steep_square(-gap, at.deep[k])
-                square = c * gap * gap + (scalar(1.0) - c) * steep
+                steep_part, _steep, _rate = steep_square(-gap, at.spared_depth[k])
+                square = c * gap * gap + (scalar(1.0) - c) * steep_part
                 wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * at.pressure_rate[k] * at.shares[f, j] * square))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -295,7 +305,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             gap, normal, curvature = surface(at.origin[k] + u[i], form)
             if gap < scalar(0.0):
                 c, change = flatness(outward, normal)
-                square, steep, _rate = steep_square(-gap, at.deep[k])
+                square, steep, _rate = steep_square(-gap, at.spared_depth[k])
                 stiffness = at.pressure_rate[k] * at.shares[f, j]
                 bearing = (-c * gap + (scalar(1.0) - c) * steep) * normal
                 if change != scalar(0.0):
@@ -303,7 +313,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
                     across = wp.dot(outward, normal)
                     along = outward - across * normal
                     bearing += (turning * curvature * across) * along
-                    slope += (at.turns[f] * stiffness * turning * inverse) * (along - wp.length_sq(along) * outward)
+                    slope += (at.follows[f] * stiffness * turning * inverse) * (along - wp.length_sq(along) * outward)
                 force_out[i] += stiffness * bearing
         if wp.length_sq(slope) > scalar(0.0):
             turn(f, at, one, other, slope, force_out)
@@ -325,7 +335,7 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             gap, normal, _curvature = surface(at.origin[k] + u[i], form)
             if gap < scalar(0.0):
                 c, _change = flatness(outward, normal)
-                _square, _steep, rate = steep_square(-gap, at.deep[k])
+                _square, _steep, rate = steep_square(-gap, at.spared_depth[k])
                 part = c + (scalar(1.0) - c) * rate
                 blocks_out[i] += (at.pressure_rate[k] * at.shares[f, j] * part) * wp.outer(normal, normal)
 
@@ -505,16 +515,22 @@ class _ObstacleContact:
         self.form = form
         self.origin = wp.array(origin, dtype=t.vector, device=self.device)
         rates = np.broadcast_to(pressure_rate, self.count)  # Pa/m
-        self.host_stiffness = 2.0 * rates * surface.areas  # N/m, where faces are steep twice what they are at last
+        self.host_stiffness = (
+            2.0 * rates * surface.areas
+        )  # N/m; between g_0 and 2 g_0 steep faces are twice as stiff as beyond
         self.pressure_rate = wp.array(rates, dtype=t.scalar, device=self.device)
         self._launch = Launcher(self.device)
         self._face_count = surface.arrays["faces"].shape[0]
-        deep = np.sqrt(SPARED * surface.resistance / rates)
-        self._deep = wp.array(deep, dtype=t.scalar, device=self.device)
+        spared_depth = np.sqrt(SPARED * np.maximum(surface.resistance, 0.0) / np.maximum(rates, np.finfo(float).tiny))
+        self._spared_depth = wp.array(spared_depth, dtype=t.scalar, device=self.device)
         self._places = place_type(dim, dtype)()
         for name, array in surface.arrays.items():
             setattr(self._places, name, array)
-        self._places.origin, self._places.pressure_rate, self._places.deep = self.origin, self.pressure_rate, self._deep
+        self._places.origin, self._places.pressure_rate, self._places.spared_depth = (
+            self.origin,
+            self.pressure_rate,
+            self._spared_depth,
+        )
         if self.friction > 0.0:
             self.magnitude = wp.zeros(self.count, dtype=t.scalar, device=self.device)
             self.normal = wp.zeros(self.count, dtype=t.vector, device=self.device)
@@ -534,7 +550,7 @@ class _ObstacleContact:
         return float(-self._gap(self.obstacle, x).min())
 
     def arrays(self) -> list[wp.array]:
-        own = [self.origin, self.pressure_rate, self._deep]
+        own = [self.origin, self.pressure_rate, self._spared_depth]
         return [*own, self.magnitude, self.normal] if self.friction > 0.0 else own
 
     def launch(self, name: str, inputs: list, outputs: list) -> None:
@@ -574,19 +590,19 @@ class ContactSurface:
         device,
     ) -> None:
         rest, points, stiffness, resistance, velocity, stopping, depth, impedance = [], [], [], [], [], [], [], []
-        faces, shares, edges, turns, count = [], [], [], [], 0
+        faces, shares, edges, follows, count = [], [], [], [], 0
         widest = max(body.mesh.boundary_faces.shape[1] for body in bodies)
         for body, start, modulus in zip(bodies, starts, p_wave, strict=True):
             mesh = body.mesh
             rest.append(mesh.points[mesh.boundary_points])
             points.append(start + mesh.boundary_points)
             own = np.searchsorted(mesh.boundary_points, mesh.boundary_faces)
-            narrow = ((0, 0), (0, widest - own.shape[1]))
-            faces.append(count + np.pad(own, narrow, mode="edge"))
-            shares.append(np.pad(np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares), narrow))
+            padding = ((0, 0), (0, widest - own.shape[1]))
+            faces.append(count + np.pad(own, padding, mode="edge"))
+            shares.append(np.pad(np.outer(mesh.boundary_face_areas, mesh.shape.face.mass_shares), padding))
             corners = mesh.points[mesh.boundary_faces[:, : mesh.dim]]
             edges.append(corners[:, 1:] - corners[:, :1])
-            turns.append(np.full(len(own), 0.0 if body.material.constitutive.small_strain else 1.0))
+            follows.append(np.full(len(own), 0.0 if body.material.constitutive.small_strain else 1.0))
             count += len(mesh.boundary_points)
             stiffness.append(np.full(len(mesh.boundary_points), modulus / mesh.mean_edge_length))
             resistance.append(np.full(len(mesh.boundary_points), modulus * mesh.mean_edge_length))
@@ -608,7 +624,7 @@ class ContactSurface:
             "faces": wp.array(host_faces, dtype=wp.int32, device=device),
             "shares": wp.array(host_shares, dtype=t.scalar, device=device),
             "edges": wp.array(np.concatenate(edges), dtype=t.vector, device=device),
-            "turns": wp.array(np.concatenate(turns), dtype=t.scalar, device=device),
+            "follows": wp.array(np.concatenate(follows), dtype=t.scalar, device=device),
             "points": wp.array(self.host_points, dtype=wp.int32, device=device),
         }
         self.stiffness = np.concatenate(stiffness)
@@ -670,7 +686,10 @@ class Contact:
         return [*self.surface.arrays.values(), *(array for part in self.parts for array in part.arrays())]
 
     def largest_stiffness_over_mass(self, mass: np.ndarray) -> float:
-        """An upper bound of the squared angular frequency [1/s^2] that contact adds."""
+        """An upper bound of the squared angular frequency [1/s^2] that the normal forces add.
+
+        What turns steep faces is left out: where they are deep it can be more, but hardly more than that of cells.
+        """
         return float((self._host_stiffness / mass[self.surface.host_points]).max())
 
     def depth(self, u: np.ndarray) -> float:
@@ -684,12 +703,12 @@ class Contact:
             part.launch_faces("contact_energy", [u], [energy_out])
 
     def add_force(self, u: wp.array, force_out: wp.array) -> None:
-        """Adds the normal forces."""
+        """Adds -dU/dx of the penalty: the normal forces, and what turns steep faces."""
         for part in self.parts:
             part.launch_faces("contact_force", [u], [force_out])
 
     def add_blocks(self, u: wp.array, blocks_out: wp.array) -> None:
-        """Adds each point's normal stiffness to its d x d block."""
+        """Adds each point's stiffness along the normal to its d x d block; the rest of d2U/dx2 is left out."""
         for part in self.parts:
             part.launch_faces("contact_blocks", [u], [blocks_out])
 

@@ -27,7 +27,7 @@ def largest_frequency(model: Model, u: wp.array | None = None) -> float:
     The largest eigenvalue of the cells' own (K_e, M_e) bounds that of the assembled pair (Irons and Treharne
     1971). It is bounded in turn by (tr A^p)^(1/p), A = M_e^-1/2 K_e M_e^-1/2, which exceeds it by at most
     (rank A)^(1/p): at rest 1.25 for linear tetrahedra and 1.15 for triangles (p = 8), 1.10 and 1.07 for quadratic ones
-    (p = 32), and so dt by at most 12 %. Contact adds the largest ratio of its stiffness to a point's mass.
+    (p = 32), and so dt by at most 12 %. Contact adds the largest ratio of its normal stiffness to a point's mass.
     """
     if u is None:
         u = model.zeros()
