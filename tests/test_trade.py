@@ -671,6 +671,21 @@ def test_why_a_reference_is_no_finer(bar, tmp_path, monkeypatch, size, limit, re
     assert remark in found
 
 
+def test_a_finer_mesh_is_priced_by_how_much_finer_it_is(bar, tmp_path, monkeypatch):
+    """By 3/2 after 4/3, in the plane 3.4 times the work."""
+
+    def priced(order: Order) -> Outcome:
+        outcome = fake(order)
+        outcome.seconds = [1.0 if order.setting["cells"] == "8" else 0.1]
+        return outcome
+
+    monkeypatch.setattr("warpfem.trade.study.run_order", priced)
+    own = study(bar, tmp_path, Here(), limit=3.0)
+    asked = own.run([Setting.of(cells=1)])
+    found = build_reference(own, mesh_control(own.problem), asked, within=0.0, explicit=True)
+    assert [rung.setting["cells"] for rung in found.ladders["space"]] == ["1", "2", "4", "6", "8"]
+
+
 def test_errors_are_not_relative_to_nothing(bar, tmp_path, in_process):
     bar.write_text(BAR.replace('{"tip": tip}', '{"nothing": lambda motion: 0.0}'))
     own = study(bar, tmp_path / "a", Here())

@@ -252,7 +252,8 @@ class _Builder:
         if len(self.meshes) < 3:
             found.insert(0, (doubled, 2.0))
         elif (own := self.mesh.finer(before[0], 2.0)) != last:
-            found.insert(0, (own, 4.0 / 3.0))
+            sizes = [point.first.mesh_size for point in self.study.solve(self._space()[-2:])]
+            found.insert(0, (own, 2.0 * sizes[1] / sizes[0]))
         return [(finer, factor) for finer, factor in found if finer is not None and finer not in self.meshes]
 
     def _grow_steps(self) -> bool:
