@@ -244,6 +244,17 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
             return two * (g - deep) * (g - deep), two * (g - deep), two
         return g * g - two * deep * deep, g, scalar(1.0)
 
+    @wp.func
+    def press(k: int, outward: vector, at: places, form: form_type, u: wp.array(dtype=vector)):
+        """c g^2 + (1 - c) s(g) of a point of a face, half its slope, half its curvature, all 0 outside; the normal."""
+        gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
+        if gap >= scalar(0.0):
+            return scalar(0.0), scalar(0.0), scalar(0.0), normal
+        c, _change = flatness(outward, normal)
+        square, steep, rate = steep_square(-gap, at.spared_depth[k])
+        other = scalar(1.0) - c
+        return c * gap * gap + other * square, -c * gap + other * steep, c + other * rate, normal
+
     @wp.kernel(module=module, enable_backward=False)
     def friction_limit(
         at: places,
@@ -259,11 +270,8 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         outward, _inverse = direction(area, rest)
         for j in range(at.faces.shape[1]):
             k = at.faces[f, j]
-            gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
-            if gap < scalar(0.0):
-                c, _change = flatness(outward, normal)
-                _square, steep, _rate = steep_square(-gap, at.spared_depth[k])
-                bearing = -c * gap + (scalar(1.0) - c) * steep
+            _square, bearing, _rate, normal = press(k, outward, at, form, u)
+            if bearing > scalar(0.0):
                 magnitude_out[k] += friction * at.pressure_rate[k] * at.shares[f, j] * bearing
                 normal_out[k] = normal
 
@@ -280,11 +288,8 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         outward, _inverse = direction(area, rest)
         for j in range(at.faces.shape[1]):
             k = at.faces[f, j]
-            gap, normal, _curvature = surface(at.origin[k] + u[at.points[k]], form)
-            if gap < scalar(0.0):
-                c, _change = flatness(outward, normal)
-                steep_part, _steep, _rate = steep_square(-gap, at.spared_depth[k])
-                square = c * gap * gap + (scalar(1.0) - c) * steep_part
+            square, _bearing, _rate, _normal = press(k, outward, at, form, u)
+            if square > scalar(0.0):
                 wp.atomic_add(energy_out, 0, wp.float64(scalar(0.5) * at.pressure_rate[k] * at.shares[f, j] * square))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -331,13 +336,10 @@ def contact_kernels(kind: type, dim: int, dtype: str) -> SimpleNamespace:
         outward, _inverse = direction(area, rest)
         for j in range(at.faces.shape[1]):
             k = at.faces[f, j]
-            i = at.points[k]
-            gap, normal, _curvature = surface(at.origin[k] + u[i], form)
-            if gap < scalar(0.0):
-                c, _change = flatness(outward, normal)
-                _square, _steep, rate = steep_square(-gap, at.spared_depth[k])
-                part = c + (scalar(1.0) - c) * rate
-                blocks_out[i] += (at.pressure_rate[k] * at.shares[f, j] * part) * wp.outer(normal, normal)
+            _square, _bearing, rate, normal = press(k, outward, at, form, u)
+            if rate > scalar(0.0):
+                stiffness = at.pressure_rate[k] * at.shares[f, j] * rate
+                blocks_out[at.points[k]] += stiffness * wp.outer(normal, normal)
 
     core_limit = None
     if kind is not Plane:
