@@ -200,7 +200,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     for module in (explicit, implicit):
         monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
     monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
-    monkeypatch.setattr("warpfem.row_sums.BLOCK", 1)
+    monkeypatch.setattr("warpfem.row_blocks.BLOCK", 1)
     if not isinstance(solver, wf.BackwardEuler):
         monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)  # as if there were many bodies
     monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
@@ -227,24 +227,16 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
 
 
 def test_steps_of_other_lengths_record_no_forces_anew(monkeypatch):
-    """With dt="auto" the length changes every some tens of steps, and recording many blocks takes as long as those."""
-    recorded, results = [], []
+    """With dt="auto" the length changes every some tens of steps."""
+    recorded = []
     record = VectorizedForce.record
     monkeypatch.setattr(VectorizedForce, "record", lambda *args: recorded.append(1) or record(*args))
-    monkeypatch.setattr("warpfem.row_sums.BLOCK", 1)
-    monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)
-    for most in (8, 0):
-        monkeypatch.setattr(explicit, "GRAPH_BLOCKS", most)
-        model = wf.Model(_scene(MESHES["box"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu", threads=1)
-        stepper, state = wf.SymplecticEuler().stepper(model), model.state()
-        state.assign(velocity=np.random.default_rng(0).normal(size=state.velocity.shape))
-        dt = 0.5 * stepper.stable_dt(state)
-        for part in (1.0, 1.0, 0.9, 0.9, 0.8, 0.7):
-            stepper.step(state, part * dt)
-        results.append(state.displacement)
-    assert model.blocks[0].vectorized.block_count == 6
-    assert len(recorded) == 2
-    np.testing.assert_array_equal(*results)
+    model = wf.Model(_scene(MESHES["box"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu", threads=1)
+    stepper, state = wf.SymplecticEuler().stepper(model), model.state()
+    dt = 0.5 * stepper.stable_dt(state)
+    for part in (1.0, 1.0, 0.9, 0.9, 0.8, 0.7):
+        stepper.step(state, part * dt)
+    assert len(recorded) == 1
 
 
 def test_threads_beside_a_body_without_strips_change_no_bit(monkeypatch):

@@ -28,9 +28,24 @@ def identity_like(A: mat33):  # noqa: F811
 
 
 @wp.func
+def plus_diagonal(A: mat22, c: Any):
+    """A + c I; the product would cost more: the compiler may not take c times 0 as 0."""
+    return wp.matrix_from_rows(wp.vector(A[0, 0] + c, A[0, 1]), wp.vector(A[1, 0], A[1, 1] + c))
+
+
+@wp.func
+def plus_diagonal(A: mat33, c: Any):  # noqa: F811
+    return wp.matrix_from_rows(
+        wp.vector(A[0, 0] + c, A[0, 1], A[0, 2]),
+        wp.vector(A[1, 0], A[1, 1] + c, A[1, 2]),
+        wp.vector(A[2, 0], A[2, 1], A[2, 2] + c),
+    )
+
+
+@wp.func
 def deformation_gradient(H: Any):
     """F = I + H."""
-    return identity_like(H) + H
+    return plus_diagonal(H, H.dtype(1.0))
 
 
 @wp.func
@@ -112,8 +127,9 @@ def volume_change(H: mat22):
 
 @wp.func
 def volume_change(H: mat33):  # noqa: F811
-    """J - 1 = tr H + I2(H) + det H."""
-    return wp.trace(H) + second_invariant(H) + wp.determinant(H)
+    """J - 1 = tr H + I2(H) + det H, of which the cofactors of H give the last two."""
+    C = cofactor(H)
+    return wp.trace(H) + wp.trace(C) + (H[0, 0] * C[0, 0] + H[0, 1] * C[0, 1] + H[0, 2] * C[0, 2])
 
 
 @wp.func
@@ -146,13 +162,13 @@ def distortion(H: mat33):  # noqa: F811
 @wp.func
 def cofactor_change(H: mat22):
     """cof F - I = (tr H) I - H^T."""
-    return wp.trace(H) * identity_like(H) - wp.transpose(H)
+    return plus_diagonal(-wp.transpose(H), wp.trace(H))
 
 
 @wp.func
 def cofactor_change(H: mat33):  # noqa: F811
     """cof F - I = (tr H) I - H^T + cof H."""
-    return wp.trace(H) * identity_like(H) - wp.transpose(H) + cofactor(H)
+    return plus_diagonal(cofactor(H) - wp.transpose(H), wp.trace(H))
 
 
 @wp.func

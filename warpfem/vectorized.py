@@ -1,14 +1,15 @@
 """Internal forces of cells on the CPU, several cells at a time in vector registers.
 
-One task takes a chunk of rows in a loop over unit-stride data with the rows in the innermost place, which the compiler
-turns into vector code of the width that the processor has. A row is a strip of linear cells (see ``strips.py``) or one
-quadratic cell: points, and some quadrature points whose deformation gradients depend on those. The forces on the points
-of the rows go to an array of their own, from which a second kernel sums them for each point (see ``row_sums.py``).
+One task takes a block of rows (see ``row_blocks.py``), chunk by chunk in a loop over unit-stride data with the rows in
+the innermost place, which the compiler turns into vector code of the width that the processor has. A row is a strip of
+linear cells (see ``strips.py``) or one quadratic cell: points, and some quadrature points whose deformation gradients
+depend on those. What the rows need of points, and exert on them, goes from and to the block's points by loads and
+stores of a point each (see ``packed_points.py``), several times as fast as number by number.
 
 What lets the compiler do it: the material's stress has no branches (``Constitutive.branchless``), or one without them
-that tells where it holds (``direct_stress``; the remaining cells are then taken one at a time); results are kept on
-the stack until the loop ends, where they cannot alias its inputs; arrays are seen through views of length 0 (Warp adds
-the length to negative indices, and adding 0 needs no test) with strides that are known at compile time.
+that tells where it holds (``direct_stress``; the remaining cells are then taken one at a time); arrays are seen through
+views of length 0 (Warp adds the length to negative indices, and adding 0 needs no test) with strides that are known at
+compile time.
 """
 
 import functools
@@ -22,7 +23,8 @@ from warpfem.dtypes import types
 from warpfem.elements import ElementKernels
 from warpfem.launches import Recordings, jobs
 from warpfem.materials.base import Constitutive
-from warpfem.row_sums import CHUNK, RowSums
+from warpfem.packed_points import packed_point_functions
+from warpfem.row_blocks import CHUNK, RowBlocks
 from warpfem.shapes import Shape
 from warpfem.strips import STRIP, cut_into_strips, order_in_space
 from warpfem.tensor import select
@@ -61,44 +63,40 @@ class Row:
 
 
 class Readers:
-    """Kernel functions that read what a row has from blocked arrays."""
+    """Kernel functions that read what the rows of a chunk have from blocked arrays."""
 
-    def __init__(self, row: Row, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
+    def __init__(self, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
         t = types(dim, dtype)
-        scalar, vector, matrix = t.scalar, t.vector, t.matrix
+        scalar, matrix = t.scalar, t.matrix
         parameter_vector = wp.types.vector(length=parameter_count, dtype=scalar)
-        width = row.width
 
         @wp.func
-        def displacement(points: wp.array(dtype=wp.int32), u: wp.array(dtype=scalar), chunk: int, a: int, lane: int):
-            """Of point ``a`` of a row."""
-            offset = points[(chunk * wp.static(width) + a) * wp.static(CHUNK) + lane]
-            value = vector()
-            for i in range(wp.static(dim)):
-                value[i] = u[offset + i]
-            return value
+        def view(blocked: wp.array(dtype=scalar), chunk: int, entries: int):
+            """A chunk's part of an array that has some entries of each row."""
+            offset = wp.uint64(chunk) * wp.uint64(entries * wp.static(CHUNK * t.numpy().itemsize))
+            return wp.array(ptr=blocked.ptr + offset, shape=(0,), dtype=scalar)
 
         @wp.func
-        def gradients(B: wp.array(dtype=scalar), place: int, lane: int):
-            """D_m^-1 [1/m]; ``place`` is where the quadrature points of one place in the rows begin."""
+        def gradients(B: wp.array(dtype=scalar), k: int, lane: int):
+            """D_m^-1 [1/m] in place ``k`` of a row."""
             value = matrix()
             for a in range(wp.static(dim)):
                 for i in range(wp.static(dim)):
-                    value[a, i] = B[place * wp.static(dim * dim) + (a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
+                    value[a, i] = B[((k * wp.static(dim) + a) * wp.static(dim) + i) * wp.static(CHUNK) + lane]
             return value
 
         @wp.func
-        def parameters(p: wp.array(dtype=scalar), place: int, lane: int):
-            """The material's."""
+        def parameters(p: wp.array(dtype=scalar), k: int, lane: int):
+            """The material's there."""
             value = parameter_vector()
             for i in range(wp.static(parameter_count)):
                 if wp.static(uniform):
                     value[i] = p[i]
                 else:
-                    value[i] = p[place * wp.static(parameter_count) + i * wp.static(CHUNK) + lane]
+                    value[i] = p[(k * wp.static(parameter_count) + i) * wp.static(CHUNK) + lane]
             return value
 
-        self.displacement, self.gradients, self.parameters = displacement, gradients, parameters
+        self.view, self.gradients, self.parameters = view, gradients, parameters
 
 
 @functools.cache
@@ -108,11 +106,16 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
     width, places, terms = row.width, row.places, row.terms
     points, weights = row.points.tolist(), row.weights.tolist()
+    point_table = wp.types.matrix(shape=(places * dim, terms), dtype=wp.int32)(row.points.ravel().tolist())
+    weight_table = wp.types.matrix(shape=(places * dim, terms), dtype=scalar)(row.weights.ravel().tolist())
     row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
     stress, direct_stress = constitutive.stress, constitutive.direct_stress
     direct = direct_stress is not None
-    read = Readers(row, constitutive.parameter_count, dim, dtype, uniform)
-    read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
+    read = Readers(constitutive.parameter_count, dim, dtype, uniform)
+    view, read_gradients, read_parameters = read.view, read.gradients, read.parameters
+    parameter_count = constitutive.parameter_count
+    packed = packed_point_functions(dim, dtype, width, CHUNK)
+    pack, load_rows, add_rows, unpack = packed.pack, packed.load_rows, packed.add_rows, packed.unpack
 
     @wp.func
     def internal_forces(
@@ -120,135 +123,127 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
         B: wp.array(dtype=scalar),
         volumes: wp.array(dtype=scalar),
         p: wp.array(dtype=scalar),
-        chunk: int,
         lane: int,
     ):
-        """On the points of a row at their displacements ``x``, and the sum of 2^k over places k of known stress."""
+        """On the points of a row at their displacements ``x``, and the sum of 2^k over places k of known stress.
+
+        With a direct stress, places where it does not hold exert none, and are left out of what is known.
+        """
         f = row_vectors()
         known = scalar(0.0)
         for k in range(wp.static(places)):
-            place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
-            gradients = read_gradients(B, place, lane)
+            gradients = read_gradients(B, k, lane)
             H = matrix()
             for a in range(wp.static(dim)):
                 change = wp.static(scalar(weights[k][a][0])) * x[wp.static(points[k][a][0])]
                 for n in range(1, wp.static(terms)):
                     change += wp.static(scalar(weights[k][a][n])) * x[wp.static(points[k][a][n])]
                 H += wp.outer(change, gradients[a])
-            own = read_parameters(p, place, lane)
+            own = read_parameters(p, k, lane)
             if wp.static(direct):
                 P, holds = direct_stress(H, own)
                 known += wp.static(scalar(2**k)) * scalar(holds)
-                weighted = -volumes[place + lane] * select(holds == 1, P, matrix())
+                weighted = -volumes[k * wp.static(CHUNK) + lane] * select(holds == 1, P, matrix())
             else:
-                weighted = -volumes[place + lane] * stress(H, own)
+                weighted = -volumes[k * wp.static(CHUNK) + lane] * stress(H, own)
             for a in range(wp.static(dim)):
                 share = weighted * gradients[a]
                 for n in range(wp.static(terms)):
                     f[wp.static(points[k][a][n])] += wp.static(scalar(weights[k][a][n])) * share
         return f, known
 
-    flags = compiler_flags(4, inlined=30000)
+    @wp.func
+    def add_remaining(
+        held: int,
+        x: wp.array(dtype=scalar),
+        B: wp.array(dtype=scalar),
+        volumes: wp.array(dtype=scalar),
+        p: wp.array(dtype=scalar),
+        lane: int,
+        f: wp.array(dtype=scalar),
+    ):
+        """Adds the forces of those places of a row that the direct stress left out, one at a time."""
+        table = wp.static(point_table)
+        weight = wp.static(weight_table)
+        k = int(0)
+        while held != wp.static(2**places - 1):
+            if (held >> k) % 2 == 0:
+                held += 1 << k
+                gradients = read_gradients(B, k, lane)
+                H = matrix()
+                for a in range(wp.static(dim)):
+                    change = vector()
+                    for n in range(wp.static(terms)):
+                        entry = table[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK) + lane
+                        for i in range(wp.static(dim)):
+                            change[i] += weight[k * wp.static(dim) + a, n] * x[entry + i * wp.static(CHUNK)]
+                    H += wp.outer(change, gradients[a])
+                weighted = -volumes[k * wp.static(CHUNK) + lane] * stress(H, read_parameters(p, k, lane))
+                for a in range(wp.static(dim)):
+                    share = weighted * gradients[a]
+                    for n in range(wp.static(terms)):
+                        entry = table[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK) + lane
+                        for i in range(wp.static(dim)):
+                            f[entry + i * wp.static(CHUNK)] += weight[k * wp.static(dim) + a, n] * share[i]
+            k += 1
+
+    flags = compiler_flags(4, "runtime-memory-check-threshold=64", inlined=30000)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
-    def row_force(
+    def block_force(
         first: int,
-        row_points: wp.array(dtype=wp.int32),
+        chunk_starts: wp.array(dtype=wp.int32),
+        point_starts: wp.array(dtype=wp.int32),
+        block_points: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.uint16),
         inverse_shape: wp.array(dtype=scalar),
         volume: wp.array(dtype=scalar),
         parameters: wp.array(dtype=scalar),
+        targets: wp.array(dtype=wp.int32),
         u: wp.array(dtype=vector),
-        force_out: wp.array(dtype=scalar),
+        packed_u: wp.array(dtype=scalar),
+        packed_force: wp.array(dtype=scalar),
+        row_u: wp.array(dtype=scalar),
+        row_force: wp.array(dtype=scalar),
         known_out: wp.array(dtype=scalar),
+        force_out: wp.array(dtype=vector),
+        aside_out: wp.array(dtype=vector),
     ):
-        """Writes the internal forces on the points of the rows of chunk ``first + tid`` in place ``tid``.
+        """Adds the internal forces of the rows of block ``first + tid`` to those on their points, or puts them aside.
 
-        With a direct stress, places where it does not hold exert none, and are left out of what is written as known.
+        ``packed_u`` to ``row_force`` are a thread's scratch; of these ``packed_force`` is 0 before and after.
         """
-        chunk = first + wp.tid()
-        own_points = wp.array(ptr=row_points.ptr, shape=(0,), dtype=wp.int32)
-        B = wp.array(ptr=inverse_shape.ptr, shape=(0,), dtype=scalar)
-        volumes = wp.array(ptr=volume.ptr, shape=(0,), dtype=scalar)
-        p = wp.array(ptr=parameters.ptr, shape=(0,), dtype=scalar)
-        displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
-        forces = wp.zeros(shape=(wp.static(width * dim * CHUNK),), dtype=scalar)
-        known = wp.zeros(shape=(wp.static(CHUNK),), dtype=scalar)  # integers could alias shapes of arrays
-        for lane in range(wp.static(CHUNK)):
-            x = row_vectors()
-            for a in range(wp.static(width)):
-                x[a] = read_displacement(own_points, displacement, chunk, a, lane)
-            f, holds = internal_forces(x, B, volumes, p, chunk, lane)
-            if wp.static(direct):
-                known[lane] = holds
-            for a in range(wp.static(width)):
-                for i in range(wp.static(dim)):
-                    forces[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane] = f[a, i]
-        out = wp.array(ptr=force_out.ptr, shape=(0,), dtype=scalar)
-        for entry in range(wp.static(width * dim * CHUNK)):
-            out[wp.tid() * wp.static(width * dim * CHUNK) + entry] = forces[entry]
-        if wp.static(direct):
+        block = first + wp.tid()
+        begin = point_starts[block]
+        end = point_starts[block + 1]
+        pack(u, block_points, begin, end, packed_u)
+        displacements = wp.array(ptr=row_u.ptr, shape=(0,), dtype=scalar)
+        forces = wp.array(ptr=row_force.ptr, shape=(0,), dtype=scalar)
+        for chunk in range(chunk_starts[block], chunk_starts[block + 1]):
+            load_rows(packed_u, row_points, chunk * wp.static(width * CHUNK), row_u)
+            B = view(inverse_shape, chunk, wp.static(places * dim * dim))
+            volumes = view(volume, chunk, wp.static(places))
+            p = view(parameters, chunk, wp.static(0 if uniform else places * parameter_count))
+            known = view(known_out, chunk, 1)
             for lane in range(wp.static(CHUNK)):
-                known_out[chunk * wp.static(CHUNK) + lane] = known[lane]
+                x = row_vectors()
+                for a in range(wp.static(width)):
+                    for i in range(wp.static(dim)):
+                        x[a, i] = displacements[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
+                f, holds = internal_forces(x, B, volumes, p, lane)
+                for a in range(wp.static(width)):
+                    for i in range(wp.static(dim)):
+                        forces[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane] = f[a, i]
+                if wp.static(direct):
+                    known[lane] = holds
+            if wp.static(direct):
+                for row in range(wp.static(CHUNK)):
+                    if known[row] != wp.static(scalar(2**places - 1)):
+                        add_remaining(int(known[row]), displacements, B, volumes, p, row, forces)
+            add_rows(row_force, row_points, chunk * wp.static(width * CHUNK), packed_force)
+        unpack(packed_force, targets, begin, end, force_out, aside_out)
 
-    return row_force
-
-
-@functools.cache
-def _remainder_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform: bool) -> wp.Kernel:
-    dim, row = shape.dim, Row(shape)
-    t = types(dim, dtype)
-    scalar, vector, matrix = t.scalar, t.vector, t.matrix
-    width, places, terms = row.width, row.places, row.terms
-    point_table = wp.types.matrix(shape=(places * dim, terms), dtype=wp.int32)(row.points.ravel().tolist())
-    weight_table = wp.types.matrix(shape=(places * dim, terms), dtype=scalar)(row.weights.ravel().tolist())
-    stress = constitutive.stress
-    read = Readers(row, constitutive.parameter_count, dim, dtype, uniform)
-    read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def remaining_force(
-        first: int,
-        row_points: wp.array(dtype=wp.int32),
-        inverse_shape: wp.array(dtype=scalar),
-        volume: wp.array(dtype=scalar),
-        parameters: wp.array(dtype=scalar),
-        u: wp.array(dtype=vector),
-        force_out: wp.array(dtype=scalar),
-        known: wp.array(dtype=scalar),
-    ):
-        """Adds the forces of those places of chunk ``first + tid`` that the direct stress left out, one at a time."""
-        chunk = first + wp.tid()
-        displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
-        points = wp.static(point_table)
-        weights = wp.static(weight_table)
-        for lane in range(wp.static(CHUNK)):
-            held = int(known[chunk * wp.static(CHUNK) + lane])
-            k = int(0)
-            while held != wp.static(2**places - 1):
-                if (held >> k) % 2 == 0:
-                    held += 1 << k
-                    place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
-                    gradients = read_gradients(inverse_shape, place, lane)
-                    H = matrix()
-                    for a in range(wp.static(dim)):
-                        change = vector()
-                        for n in range(wp.static(terms)):
-                            point = points[k * wp.static(dim) + a, n]
-                            x = read_displacement(row_points, displacement, chunk, point, lane)
-                            change += weights[k * wp.static(dim) + a, n] * x
-                        H += wp.outer(change, gradients[a])
-                    weighted = -volume[place + lane] * stress(H, read_parameters(parameters, place, lane))
-                    start = wp.tid() * wp.static(width * dim * CHUNK) + lane
-                    for a in range(wp.static(dim)):
-                        share = weighted * gradients[a]
-                        for n in range(wp.static(terms)):
-                            weight = weights[k * wp.static(dim) + a, n]
-                            target = start + points[k * wp.static(dim) + a, n] * wp.static(dim * CHUNK)
-                            for i in range(wp.static(dim)):
-                                force_out[target + i * wp.static(CHUNK)] += weight * share[i]
-                k += 1
-
-    return remaining_force
+    return block_force
 
 
 class VectorizedForce:
@@ -264,7 +259,10 @@ class VectorizedForce:
         team: the threads among which :meth:`add` divides its work.
 
     Attributes:
-        block_count, chunk_count: blocks and chunks of rows.
+        chunk_count: chunks of rows.
+        blocks: of these.
+        cell_arrays: what the rows have of their cells, by chunk: D_m^-1, volumes and parameters.
+        scratch: of each thread: displacements of and forces on a block's points, packed, and those of a chunk's rows.
         uniform: whether all cells have the same parameters.
         known: for a material with a direct stress, for each row the sum of 2^k over those of its quadrature points k
             where it held in the last forces computed.
@@ -288,9 +286,7 @@ class VectorizedForce:
         dtype = t.name
         self.uniform = uniform = len(parameters) == 1
         made_for = (kernels.constitutive, shape, dtype, uniform)
-        self._kernels = [_force_kernel(*made_for)]
-        if kernels.constitutive.direct_stress is not None:
-            self._kernels.append(_remainder_kernel(*made_for))
+        self._kernel = _force_kernel(*made_for)
         if shape.order == 1:
             strips = cut_into_strips(rest_points, host_cells)
             points, quadrature = strips.points, strips.cells
@@ -305,30 +301,30 @@ class VectorizedForce:
         real = quadrature >= 0
         if shape.order == 1:
             gradients = self._gradients(host_cells, inverse_shape, points, quadrature)
-            occupied = np.zeros(points.shape, dtype=bool)
-            for k in range(STRIP):
-                occupied[:, k : k + dim + 1] |= real[:, k, None]
         else:
             gradients = np.where(real[:, :, None, None], inverse_shape[quadrature], 0.0)
-            occupied = np.repeat(real[:, :1], points.shape[1], axis=1)
         if not uniform:
             of_cells = parameters[quadrature // shape.quadrature_count]
-        self.arrays_by_name = {
-            "row_points": self._blocked(dim * points, wp.int32),
-            "inverse_shape": self._blocked(gradients, t.scalar),
-            "volume": self._blocked(np.where(real, volumes[quadrature], 0.0), t.scalar),
-            "parameters": wp.array(parameters.ravel(), dtype=t.scalar, device="cpu")
+        self.blocks = RowBlocks(points, dim, dtype, team.size)
+        self.cell_arrays = [
+            self._chunked(gradients, t.scalar),
+            self._chunked(np.where(real, volumes[quadrature], 0.0), t.scalar),
+            wp.array(parameters.ravel(), dtype=t.scalar, device="cpu")
             if uniform
-            else self._blocked(np.where(real[:, :, None], of_cells, parameters[0]), t.scalar),
-        }
-        self.known = wp.zeros(len(points) if len(self._kernels) == 2 else 0, dtype=t.scalar, device="cpu")
-        self._sums = RowSums(points, occupied, dim, dtype, team.size)
-        self.block_count = len(self._sums.chunks)
+            else self._chunked(np.where(real[:, :, None], of_cells, parameters[0]), t.scalar),
+        ]
+        direct = kernels.constitutive.direct_stress is not None
+        self.known = wp.zeros(len(points) if direct else 0, dtype=t.scalar, device="cpu")
+        of_rows = points.shape[1] * dim * CHUNK
+        self.scratch = [
+            [self.blocks.scratch(), self.blocks.scratch(), *(wp.zeros(of_rows, t.scalar, device="cpu") for _ in "uf")]
+            for _ in range(team.size)
+        ]
 
-    def _blocked(self, rows: np.ndarray, dtype: type) -> wp.array:
+    def _chunked(self, rows: np.ndarray, dtype: type) -> wp.array:
         """Rows (count, ...) as one array with those of a chunk innermost."""
-        blocks = rows.reshape(self.chunk_count, CHUNK, -1).transpose(0, 2, 1)
-        return wp.array(np.ascontiguousarray(blocks, dtype=wp.dtype_to_numpy(dtype)).ravel(), dtype=dtype, device="cpu")
+        chunks = rows.reshape(self.chunk_count, CHUNK, -1).transpose(0, 2, 1)
+        return wp.array(np.ascontiguousarray(chunks, dtype=wp.dtype_to_numpy(dtype)).ravel(), dtype=dtype, device="cpu")
 
     def _gradients(
         self, host_cells: np.ndarray, inverse_shape: np.ndarray, points: np.ndarray, cells: np.ndarray
@@ -346,30 +342,31 @@ class VectorizedForce:
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
-        return [*self.arrays_by_name.values(), self.known, *self._sums.arrays()]
+        scratch = [array for own in self.scratch for array in own]
+        return [*self.cell_arrays, self.known, *self.blocks.arrays(), *scratch]
 
-    def record(self, u: wp.array, force_out: wp.array) -> list[list[wp.Launch | None]]:
-        """The launches of each thread that add the internal forces at ``u`` to ``force_out``, in their order.
+    def record(self, u: wp.array, force_out: wp.array) -> list[wp.Launch | None]:
+        """The launch of each thread that adds the internal forces at ``u`` to ``force_out``.
 
         Once all threads are done, those of :meth:`record_aside` are to follow.
         """
-        return [self._record_blocks(thread, u, force_out) for thread in range(self._team.size)]
-
-    def _record_blocks(self, thread: int, u: wp.array, force_out: wp.array) -> list[wp.Launch | None]:
-        launches = []
-        for block in self._sums.blocks[thread]:
-            chunks = self._sums.chunks[block]
-            inputs = [chunks.start, *self.arrays_by_name.values(), u]
-            outputs = [self._sums.scratch[thread], self.known]
-            for kernel in self._kernels:
-                launch = wp.launch(kernel, len(chunks), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
-                launches.append(launch)
-            launches.append(self._sums.record_block(block, thread, force_out))
-        return launches
+        blocks = self.blocks
+        shared = [blocks.chunk_starts, blocks.point_starts, blocks.points, blocks.rows, *self.cell_arrays]
+        return [
+            wp.launch(
+                self._kernel,
+                len(own),
+                inputs=[own.start, *shared, blocks.targets, u, *scratch],
+                outputs=[self.known, force_out, blocks.aside],
+                device="cpu",
+                record_cmd=True,
+            )
+            for own, scratch in zip(blocks.of_thread, self.scratch, strict=True)
+        ]
 
     def record_aside(self, force_out: wp.array, points: range) -> wp.Launch | None:
         """The launch that then adds what threads have put aside to a range of points; ``None`` for nothing."""
-        return self._sums.record_aside(force_out, points)
+        return self.blocks.record_aside(force_out, points)
 
     def add(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the internal forces at ``u`` to ``force_out``."""
@@ -379,9 +376,9 @@ class VectorizedForce:
 
     def _record(self, u: wp.array, force_out: wp.array) -> tuple[Callable[[list[Job]], None], list[Job]]:
         size = self._team.size
-        launches = self.record(u, force_out)
+        launches = [[launch] for launch in self.record(u, force_out)]
         if size == 1:
-            return self._team.run, jobs(launches, as_graphs=not wp.get_device("cpu").is_capturing)
+            return self._team.run, jobs(launches, as_graphs=False)
         barrier = Barrier(self._team)
         for own, points in zip(launches, share(len(force_out), size), strict=True):
             own += [barrier.record(), self.record_aside(force_out, points)]

@@ -10,9 +10,9 @@ from warpfem.tensor import (
     cofactor,
     deformation_gradient,
     distortion,
-    identity_like,
     log1p_deficit,
     log_volume_ratio,
+    plus_diagonal,
     volume_change,
     volume_ratio,
 )
@@ -36,16 +36,16 @@ def energy_density(H: Any, parameters: Any):
 def stress(H: Any, parameters: Any):
     # P = tau F^-T with the Kirchhoff stress tau = mu (F F^T - I) + lam ln(J) I
     transposed = wp.transpose(H)
-    kirchhoff = parameters[0] * (H + transposed + H * transposed) + (
-        parameters[1] * log_volume_ratio(H)
-    ) * identity_like(H)
-    return (kirchhoff * cofactor(deformation_gradient(H))) / volume_ratio(H)
+    inverse = H.dtype(1.0) / volume_ratio(H)
+    strain = (parameters[0] * inverse) * (H + transposed + H * transposed)
+    kirchhoff_over_j = plus_diagonal(strain, parameters[1] * inverse * log_volume_ratio(H))
+    return kirchhoff_over_j * cofactor(deformation_gradient(H))
 
 
 @wp.func
 def stress_differential(H: Any, dH: Any, parameters: Any):
     # dP = mu dF + (mu - lam ln J) F^-T dF^T F^-T + lam (F^-T : dF) F^-T
-    G = cofactor(deformation_gradient(H)) / volume_ratio(H)
+    G = (H.dtype(1.0) / volume_ratio(H)) * cofactor(deformation_gradient(H))
     return (
         parameters[0] * dH
         + (parameters[0] - parameters[1] * log_volume_ratio(H)) * (G * wp.transpose(dH) * G)

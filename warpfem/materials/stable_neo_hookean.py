@@ -13,9 +13,9 @@ from warpfem.tensor import (
     cofactor_differential,
     deformation_gradient,
     distortion,
-    identity_like,
     length_change,
     log1p_deficit,
+    plus_diagonal,
     volume_change,
 )
 
@@ -33,10 +33,10 @@ def energy_density(H: Any, parameters: Any):
 def stress(H: Any, parameters: Any):
     # mu' (1 - 1/(I_C + 1)) F + lam' (J - a) cof F, with the parts that cancel at rest taken out
     s = length_change(H)
-    change = cofactor_change(H)
-    softening = s / (H.dtype(4.0) * (H.dtype(4.0) + s))
-    shear = H.dtype(0.75) * (H - change) + softening * deformation_gradient(H)
-    return parameters[0] * shear + (parameters[1] * volume_change(H)) * (identity_like(H) + change)
+    softening = parameters[0] * (s / (H.dtype(4.0) * (H.dtype(4.0) + s)))
+    shear = H.dtype(0.75) * parameters[0]
+    pressure = parameters[1] * volume_change(H)
+    return plus_diagonal((shear + softening) * H + (pressure - shear) * cofactor_change(H), softening + pressure)
 
 
 @wp.func

@@ -30,10 +30,6 @@ VECTORIZED_CELLS = 1024
 """Cells of a material, quadratic ones counted by their quadrature points, from which on its forces are computed several
 cells at a time: that takes some seconds to compile once, and work to prepare."""
 
-GRAPH_BLOCKS = 8
-"""Blocks of forces up to which a step on one thread is one graph. That has to be made anew where the length of the step
-changes, which takes 0.3 ms for each block, so that with more of them the forces are a graph of their own."""
-
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
 
@@ -93,7 +89,6 @@ class _Passes:
         self._team = model.team
         self._barrier = Barrier(self._team) if self._team.size > 1 else None
         self._points = share(model.point_count, self._team.size, CHUNK)
-        self._as_graphs = not _is_one_graph(model)
         self._recordings, self._steps = Recordings(), Recordings()
 
     def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
@@ -119,24 +114,17 @@ class _Passes:
         launches: list[list[wp.Launch | None]] = [[] for _ in self._points]
         for force in self._forces:
             for all_own, own in zip(launches, force.record(u, self._force), strict=True):
-                all_own.extend(own)
+                all_own.append(own)
         if self._barrier is not None:
             for own, points in zip(launches, self._points, strict=True):
                 own.append(self._barrier.record())
                 own.extend(force.record_aside(self._force, points) for force in self._forces)
-        return jobs(launches, SubnormalsFlushed, self._as_graphs)
+        return jobs(launches, SubnormalsFlushed, as_graphs=self._team.size > 1)  # else the whole step is one
 
 
 def _in_turn(first: Job, second: Job) -> None:
     first()
     second()
-
-
-def _is_one_graph(model: Model) -> bool:
-    """Whether a step is one graph, of which no other can be a part: where it is short, and the work of one thread."""
-    forces = [block.vectorized for block in model.blocks if block.vectorized]
-    small = not forces or (model.team.size == 1 and sum(force.block_count for force in forces) <= GRAPH_BLOCKS)
-    return model.device.is_cpu and small
 
 
 class _ExplicitStepper(Stepper):
@@ -159,7 +147,8 @@ class _ExplicitStepper(Stepper):
         if all(block.vectorized for block in model.blocks):
             self._passes = _Passes(model, self._force)
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
-        self._as_graph = _is_one_graph(model)
+        alone = model.team.size == 1 or not any(block.vectorized for block in model.blocks)
+        self._as_graph = model.device.is_cpu and alone
         self._launched: Hashable = None  # what the last step's launches were made for
         self._graphs = Recordings()
         self._inverse_mass = self._free_inverse_mass()

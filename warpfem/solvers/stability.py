@@ -89,9 +89,8 @@ class Watch:
         self.model = model
         density = _cell_densities(model)
         self._densities = [self._device_array(density[block.index]) for block in model.blocks]
-        threads = model.team.size
         self._vectorized = [
-            VectorizedFrequency(block, float(density[block.index[0]]), threads)
+            VectorizedFrequency(block, float(density[block.index[0]]))
             if can_vectorize(block, density[block.index])
             else None
             for block in model.blocks

@@ -1,6 +1,6 @@
 """Estimates of the largest frequency of each linear cell alone, several cells at a time: see ``vectorized.py``.
 
-They are those of the plain kernel (``ElementKernels.frequency``), the largest of each chunk of strips in a place of its
+They are those of the plain kernel (``ElementKernels.frequency``), the largest of each block of strips in a place of its
 own.
 """
 
@@ -13,10 +13,10 @@ from warpfem.dtypes import types
 from warpfem.elements import LARGE
 from warpfem.materials.base import Constitutive
 from warpfem.model import CellBlock
-from warpfem.row_sums import CHUNK
+from warpfem.packed_points import packed_point_functions
+from warpfem.row_blocks import CHUNK
 from warpfem.shapes import Shape
 from warpfem.tensor import deformation_gradient, direct_rotation
-from warpfem.threads import share
 from warpfem.vector_code import compiler_flags
 from warpfem.vectorized import Readers, Row
 
@@ -69,19 +69,21 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
     width, places = row.width, row.places
     row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
-    read = Readers(row, constitutive.parameter_count, dim, dtype, uniform)
-    read_displacement, read_gradients, read_parameters = read.displacement, read.gradients, read.parameters
+    read = Readers(constitutive.parameter_count, dim, dtype, uniform)
+    view, read_gradients, read_parameters = read.view, read.gradients, read.parameters
+    packed = packed_point_functions(dim, dtype, width, CHUNK)
+    values_of_rows = wp.types.vector(length=CHUNK, dtype=scalar)
+    pack, load_rows = packed.pack, packed.load_rows
     tangent, differential = _rule(constitutive, dim, dtype)
     flags = compiler_flags(4, inlined=30000)
 
     @wp.func
-    def largest_square(x: row_vectors, B: wp.array(dtype=scalar), p: wp.array(dtype=scalar), chunk: int, lane: int):
+    def largest_square(x: row_vectors, B: wp.array(dtype=scalar), p: wp.array(dtype=scalar), lane: int):
         """Of the cells of a strip of density 1, and whether all are known."""
         largest = scalar(0.0)
         known = scalar(1.0)
         for k in range(wp.static(places)):
-            place = (chunk * wp.static(places) + k) * wp.static(CHUNK)
-            gradients = read_gradients(B, place, lane)
+            gradients = read_gradients(B, k, lane)
             H = matrix()
             Q = matrix()
             first = vector()
@@ -96,7 +98,7 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
             for i in range(wp.static(dim)):
                 G[i, (i + 1) % wp.static(dim)] += scalar(0.1)
             G = deformation_gradient(H) * G  # turned with the body
-            own = read_parameters(p, place, lane)
+            own = read_parameters(p, k, lane)
             R, holds = tangent(H)
             known = wp.min(known, scalar(holds))
             size = wp.sqrt(wp.ddot(G, G))
@@ -111,39 +113,46 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def strip_frequency(
         first: int,
-        row_points: wp.array(dtype=wp.int32),
+        chunk_starts: wp.array(dtype=wp.int32),
+        point_starts: wp.array(dtype=wp.int32),
+        block_points: wp.array(dtype=wp.int32),
+        row_points: wp.array(dtype=wp.uint16),
         inverse_shape: wp.array(dtype=scalar),
-        volume: wp.array(dtype=scalar),
         parameters: wp.array(dtype=scalar),
         u: wp.array(dtype=vector),
+        packed_u: wp.array(dtype=scalar),
+        row_u: wp.array(dtype=scalar),
         square_out: wp.array(dtype=scalar),
         known_out: wp.array(dtype=scalar),
     ):
-        """Writes the largest squared frequency of chunk ``first + tid`` at density 1, and whether all are known."""
-        chunk = first + wp.tid()
-        own_points = wp.array(ptr=row_points.ptr, shape=(0,), dtype=wp.int32)
-        B = wp.array(ptr=inverse_shape.ptr, shape=(0,), dtype=scalar)
-        p = wp.array(ptr=parameters.ptr, shape=(0,), dtype=scalar)
-        displacement = wp.array(ptr=u.ptr, shape=(0,), dtype=scalar)
-        squares = wp.zeros(shape=(wp.static(CHUNK),), dtype=scalar)
-        known = wp.zeros(shape=(wp.static(CHUNK),), dtype=scalar)
-        for lane in range(wp.static(CHUNK)):
-            x = row_vectors()
-            for a in range(wp.static(width)):
-                x[a] = read_displacement(own_points, displacement, chunk, a, lane)
-            square, holds = largest_square(x, B, p, chunk, lane)
-            squares[lane] = square
-            known[lane] = holds
+        """Writes the largest squared frequency of block ``first + tid`` at density 1, and whether all are known."""
+        block = first + wp.tid()
+        pack(u, block_points, point_starts[block], point_starts[block + 1], packed_u)
+        displacements = wp.array(ptr=row_u.ptr, shape=(0,), dtype=scalar)
+        squares = values_of_rows()
+        known = values_of_rows()
         largest = scalar(0.0)
         all_known = scalar(1.0)
-        for lane in range(wp.static(CHUNK)):
-            square = scalar(wp.static(dim + 1)) * squares[lane]
-            if not (square < scalar(wp.static(LARGE))):
-                square = scalar(wp.static(LARGE))
-            largest = wp.max(largest, square)
-            all_known = wp.min(all_known, known[lane])
-        square_out[chunk] = largest
-        known_out[chunk] = all_known
+        for chunk in range(chunk_starts[block], chunk_starts[block + 1]):
+            load_rows(packed_u, row_points, chunk * wp.static(width * CHUNK), row_u)
+            B = view(inverse_shape, chunk, wp.static(places * dim * dim))
+            p = view(parameters, chunk, wp.static(0 if uniform else places * constitutive.parameter_count))
+            for lane in range(wp.static(CHUNK)):
+                x = row_vectors()
+                for a in range(wp.static(width)):
+                    for i in range(wp.static(dim)):
+                        x[a, i] = displacements[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
+                square, holds = largest_square(x, B, p, lane)
+                squares[lane] = square
+                known[lane] = holds
+            for row in range(wp.static(CHUNK)):
+                square = scalar(wp.static(dim + 1)) * squares[row]
+                if not (square < scalar(wp.static(LARGE))):
+                    square = scalar(wp.static(LARGE))
+                largest = wp.max(largest, square)
+                all_known = wp.min(all_known, known[row])
+        square_out[block] = largest
+        known_out[block] = all_known
 
     return strip_frequency
 
@@ -154,19 +163,17 @@ class VectorizedFrequency:
     Args:
         block: the block.
         density: of its cells [kg/m^3].
-        threads: among which the work is divided.
     """
 
-    def __init__(self, block: CellBlock, density: float, threads: int) -> None:
+    def __init__(self, block: CellBlock, density: float) -> None:
         force, kernels = block.vectorized, block.kernels
         assert force is not None
         t = kernels.types
         self._kernel = _frequency_kernel(kernels.constitutive, block.shape, t.name, force.uniform)
-        self._arrays = list(force.arrays_by_name.values())
+        self._force = force
         self._density = density
-        self._parts = share(force.chunk_count, threads)
-        self._squares = wp.zeros(force.chunk_count, dtype=t.scalar, device="cpu")
-        self._known = wp.zeros(force.chunk_count, dtype=t.scalar, device="cpu")
+        self._squares = wp.zeros(force.blocks.count, dtype=t.scalar, device="cpu")
+        self._known = wp.zeros(force.blocks.count, dtype=t.scalar, device="cpu")
 
     def arrays(self) -> list[wp.array]:
         """The device arrays held."""
@@ -174,9 +181,13 @@ class VectorizedFrequency:
 
     def record(self, u: wp.array, thread: int) -> wp.Launch | None:
         """The launch of a thread's part."""
-        part = self._parts[thread]
-        inputs, outputs = [part.start, *self._arrays, u], [self._squares, self._known]
-        return wp.launch(self._kernel, len(part), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
+        blocks, (gradients, _, parameters) = self._force.blocks, self._force.cell_arrays
+        packed_u, _, row_u, _ = self._force.scratch[thread]
+        own = blocks.of_thread[thread]
+        rows = [blocks.chunk_starts, blocks.point_starts, blocks.points, blocks.rows]
+        inputs = [own.start, *rows, gradients, parameters, u, packed_u, row_u]
+        outputs = [self._squares, self._known]
+        return wp.launch(self._kernel, len(own), inputs=inputs, outputs=outputs, device="cpu", record_cmd=True)
 
     def square(self) -> float | None:
         """The largest [1/s^2], once all parts are done; ``None`` if that of some cell is not known."""
