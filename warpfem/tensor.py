@@ -121,15 +121,15 @@ def cofactor_differential(A: mat33, dA: mat33):  # noqa: F811
 
 @wp.func
 def volume_change(H: mat22):
-    """J - 1 = tr H + det H."""
-    return H[0, 0] + H[1, 1] + (H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0])
+    """J - 1."""
+    return H[0, 0] + (H.dtype(1.0) + H[0, 0]) * H[1, 1] - H[0, 1] * H[1, 0]
 
 
 @wp.func
 def volume_change(H: mat33):  # noqa: F811
-    """J - 1 = tr H + I2(H) + det H, of which the cofactors of H give the last two."""
-    C = cofactor(H)
-    return wp.trace(H) + wp.trace(C) + (H[0, 0] * C[0, 0] + H[0, 1] * C[0, 1] + H[0, 2] * C[0, 2])
+    """J - 1, expanded by the first row of F, with the cofactors' changes."""
+    change = cofactor_change(H)
+    return H[0, 0] + (H.dtype(1.0) + H[0, 0]) * change[0, 0] + (H[0, 1] * change[0, 1] + H[0, 2] * change[0, 2])
 
 
 @wp.func
@@ -161,14 +161,34 @@ def distortion(H: mat33):  # noqa: F811
 
 @wp.func
 def cofactor_change(H: mat22):
-    """cof F - I = (tr H) I - H^T."""
-    return plus_diagonal(-wp.transpose(H), wp.trace(H))
+    """cof F - I."""
+    return cofactor(H)
 
 
 @wp.func
 def cofactor_change(H: mat33):  # noqa: F811
-    """cof F - I = (tr H) I - H^T + cof H."""
-    return plus_diagonal(cofactor(H) - wp.transpose(H), wp.trace(H))
+    """cof F - I: minors of I + H, less 1 in the diagonal, with what cancels left out."""
+    one = H.dtype(1.0)
+    a = one + H[0, 0]
+    b = one + H[1, 1]
+    c = one + H[2, 2]
+    return wp.matrix_from_rows(
+        wp.vector(
+            H[1, 1] + b * H[2, 2] - H[1, 2] * H[2, 1],
+            H[1, 2] * H[2, 0] - c * H[1, 0],
+            H[1, 0] * H[2, 1] - b * H[2, 0],
+        ),
+        wp.vector(
+            H[0, 2] * H[2, 1] - c * H[0, 1],
+            H[2, 2] + c * H[0, 0] - H[0, 2] * H[2, 0],
+            H[0, 1] * H[2, 0] - a * H[2, 1],
+        ),
+        wp.vector(
+            H[0, 1] * H[1, 2] - b * H[0, 2],
+            H[0, 2] * H[1, 0] - a * H[1, 2],
+            H[0, 0] + a * H[1, 1] - H[0, 1] * H[1, 0],
+        ),
+    )
 
 
 @wp.func

@@ -10,6 +10,7 @@ from warpfem.tensor import (
     cofactor,
     deformation_gradient,
     distortion,
+    length_change,
     log1p_deficit,
     log_volume_ratio,
     plus_diagonal,
@@ -26,10 +27,10 @@ def energy_density(H: Any, parameters: Any):
         return H.dtype(wp.inf)
     log_j = log_volume_ratio(H)
     j = volume_change(H)
-    deficit = j - log_j  # j - ln(1 + j)
-    if j > H.dtype(-0.5):
-        deficit = log1p_deficit(j)
-    return parameters[0] * (half * distortion(H) + deficit) + half * parameters[1] * log_j * log_j
+    shear = half * length_change(H) - log_j
+    if wp.abs(j) < half:  # where these would cancel
+        shear = half * distortion(H) + log1p_deficit(j)
+    return parameters[0] * shear + half * parameters[1] * log_j * log_j
 
 
 @wp.func
