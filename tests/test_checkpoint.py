@@ -453,7 +453,7 @@ def test_a_failed_run_keeps_the_good_frames_and_the_failing_state(tmp_path: Path
 def test_the_failing_state_keeps_numbers_that_are_not_finite_and_the_attempt(tmp_path: Path, monkeypatch) -> None:
     simulation = wf.Simulation(pushed_block())
 
-    def fail(state, dt):
+    def fail(state, dt, most):
         broken = state.displacement
         broken[3] = np.nan
         state.u.assign(broken.astype(np.float32))
@@ -462,7 +462,7 @@ def test_the_failing_state_keeps_numbers_that_are_not_finite_and_the_attempt(tmp
 
     with pytest.raises(wf.SimulationError), closing(wf.record(simulation, tmp_path / "run.usdc")) as frames:
         next(frames)
-        monkeypatch.setattr(simulation.stepper, "step", fail)
+        monkeypatch.setattr(simulation.stepper, "advance", fail)
         next(frames)
     with np.load(failure_path(tmp_path / "run.usdc")) as failed:
         assert np.isnan(failed["displacement"][3]).all() and np.isfinite(failed["displacement"][4]).all()

@@ -52,7 +52,7 @@ def test_true_limit_separates_stable_from_unstable(solver, dim):
         noise = 1e-9 * rng.normal(size=irregular_mesh(dim).points.shape)  # small: about rest everything is linear
         model, state, stepper = ready(Scene([irregular(dim, velocity=noise)], solver))
         stepper._limit = np.inf  # the estimate is below the limit that is tried
-        stepper._look = lambda state, dt: None
+        stepper._look = lambda *_: None
         start = model.energies(state).total
         advance(stepper, state, fraction * 2.0 / modes(model)[0][-1], steps)
         return model.energies(state).total / start
@@ -300,8 +300,46 @@ def test_steps_of_automatic_length_come_again():
     """What is left of a frame differs by roundings: as lengths of their own these would be launched and kept anew."""
     simulation = Simulation(Scene([slab(2)], VelocityVerlet(), gravity=(0.0, -9.81), dt="auto", frames=2))
     lengths = []
-    launch = simulation.stepper.step
-    simulation.stepper.step = lambda state, dt: (lengths.append(dt), launch(state, dt))[1]
+    take = simulation.stepper.advance
+
+    def noted(state, dt, most):
+        count, report = take(state, dt, most)
+        lengths.extend([dt] * count)
+        return count, report
+
+    simulation.stepper.advance = noted
     *_, last = simulation.frames()
     assert last.time == pytest.approx(2 / 24, abs=1e-10)
     assert len(set(lengths)) < 0.2 * len(lengths)
+
+
+@pytest.mark.parametrize("supports", [[Pin("left")], [PrescribedMotion("left", lambda rest, time: rest + 0.1 * time)]])
+@pytest.mark.parametrize("solver", EXPLICIT, ids=solver_name)
+def test_steps_taken_several_at_a_time_have_the_bits_of_single_ones(solver, supports):
+    """Where supports move, each step has its own place for them: then steps are taken one by one."""
+    floor = Plane((0.0, 0.01), (0.0, 1.0), friction=0.3)
+    scene = Scene([slab(2, supports=supports, velocity=(1.0, 0.0))], solver, gravity=(0, -9.81), obstacles=[floor])
+    states, counts = [], []
+    for most in (1, 100):
+        _, state, stepper = ready(scene)
+        dt, left = 0.25 * stepper.stable_dt(), 53
+        while left:
+            count, _ = stepper.advance(state, dt, min(most, left))
+            counts.append(count)
+            left -= count
+        states.append(state)
+    assert max(counts) == (8 if isinstance(supports[0], Pin) else 1)
+    assert states[0].time == states[1].time
+    np.testing.assert_array_equal(states[0].displacement, states[1].displacement)
+    np.testing.assert_array_equal(states[0].velocity, states[1].velocity)
+
+
+def test_no_look_at_the_stability_is_passed_over(monkeypatch):
+    """Whatever number of steps a caller asks for: a blow-up is to be seen where single steps would see it."""
+    _, state, stepper = ready(Scene([slab(2)], VelocityVerlet()))
+    seen = []
+    monkeypatch.setattr(Watch, "is_unstable", lambda *_: seen.append(stepper._steps))
+    dt = 0.25 * stepper.stable_dt()
+    while stepper._steps < 100:
+        stepper.advance(state, dt, 5)
+    assert seen == list(range(stepper._interval, 100, stepper._interval))

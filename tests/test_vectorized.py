@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import warpfem as wf
-from warpfem.barrier import Barrier
+from warpfem.barrier import Barriers
 from warpfem.linear import tangent_operator
 from warpfem.solvers import explicit, implicit
 from warpfem.solvers.stability import Watch
@@ -201,8 +201,6 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
     monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.row_blocks.BLOCK", 1)
-    if not isinstance(solver, wf.BackwardEuler):
-        monkeypatch.setattr("warpfem.launches.MOST_SINGLE", 0)  # as if there were many bodies
     monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
     monkeypatch.setattr("warpfem.linear.operators.SLICED_POINTS", 64)
     monkeypatch.setattr("warpfem.linear.slices.SLICES_PER_THREAD", 1)
@@ -212,13 +210,15 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
     for threads in (1, 2, 3):
         body = wf.Body("body", mesh, wf.StableNeoHookean(E=1e5, nu=0.3), supports=[wf.Pin("bottom")])
         small = wf.Body("small", MESHES["box of six"], wf.LinearElasticity(E=1e5, nu=0.3), element="quadratic")
-        scene = wf.Scene([body, small], solver, gravity=(0, -9.81, 0), damping=1.0)
+        lid = wf.Plane((0, 0.99, 0), (0, -1, 0.1), friction=0.3)
+        scene = wf.Scene([body, small], solver, gravity=(0, -9.81, 0), damping=1.0, obstacles=[lid])
         model = wf.Model(scene, device="cpu", threads=threads)
         stepper, state = solver.stepper(model), model.state()
         assert model.team.size == threads and model.blocks[0].vectorized
         dt = 0.5 * (stepper.stable_dt(state) or 0.02)
-        for _ in range(20):
-            stepper.step(state, dt)
+        left = 20
+        while left:
+            left -= stepper.advance(state, dt, left)[0]
         results.append((state.displacement, state.velocity, stepper.estimate_stable_dt(state)))
     for displacement, velocity, limit in results[1:]:
         np.testing.assert_array_equal(displacement, results[0][0])
@@ -313,32 +313,34 @@ def test_a_team_runs_all_jobs_and_passes_on_a_failure():
 
 def test_no_thread_passes_a_barrier_before_all_have_come():
     """With more threads than most machines for tests have cores."""
-    barrier, seen = Barrier(Team(5)), []
-    wait = barrier.record()
+    barriers, seen = Barriers(Team(5), 2), []
+    first, second = barriers.record(0), barriers.record(1)
 
     def work():
         seen.append("before")
-        wait.launch()
+        first.launch()
+        seen.append("between")
+        second.launch()
         seen.append("after")
 
     for _ in range(20):
-        barrier.run([work] * 5)
-    assert seen == (["before"] * 5 + ["after"] * 5) * 20
+        barriers.run([work] * 5)
+    assert seen == (["before"] * 5 + ["between"] * 5 + ["after"] * 5) * 20
 
 
 @pytest.mark.parametrize("failing", [0, 2])
 @pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
 def test_a_thread_that_fails_holds_no_other_at_a_barrier(failing, failure):
-    barrier = Barrier(Team(3))
-    wait = barrier.record()
+    barriers = Barriers(Team(3), 1)
+    wait = barriers.record(0)
 
     def fail():
         time.sleep(0.01)
         raise failure("a job")
 
     with pytest.raises(failure, match="a job"):
-        barrier.run([fail if thread == failing else wait.launch for thread in range(3)])
-    barrier.run([wait.launch] * 3)
+        barriers.run([fail if thread == failing else wait.launch for thread in range(3)])
+    barriers.run([wait.launch] * 3)
 
 
 @pytest.mark.usefixtures("interrupts")
@@ -363,7 +365,8 @@ def test_an_interrupted_team_waits_for_all_before_it_tells(where):
 def test_an_explicit_stepper_goes_with_its_last_reference():
     model = wf.Model(_scene(MESHES["box"], wf.StableNeoHookean(E=1e5, nu=0.3)), device="cpu")
     stepper, state = model.scene.solver.stepper(model), model.state()
-    stepper.step(state, 0.5 * stepper.stable_dt(state))
+    for _ in range(3):
+        stepper.advance(state, 0.5 * stepper.stable_dt(state), 8)
     known = weakref.ref(stepper)
     gc.collect()
     gc.disable()

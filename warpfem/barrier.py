@@ -1,4 +1,4 @@
-"""A barrier within the work of several threads: none goes on before all have come, without a detour through Python."""
+"""Barriers within the work of several threads: none goes on before all have come, without a detour through Python."""
 
 import ctypes
 import functools
@@ -14,10 +14,11 @@ RELEASED = 2**30
 
 _WAIT = """
     typedef wp::int32 (*Rest)(wp::uint32);
-    __atomic_fetch_add(counter.data, 1, __ATOMIC_ACQ_REL);
-    for (wp::int32 turn = 0; __atomic_load_n(counter.data, __ATOMIC_ACQUIRE) < threads; ++turn) {
-        if (turn > 2000) {  // some tens of microseconds; who looks on for longer takes the time of those that work
-            turn = 2000;
+    wp::int32* count = counts.data + index;
+    __atomic_fetch_add(count, 1, __ATOMIC_ACQ_REL);
+    for (wp::int32 turn = 0; __atomic_load_n(count, __ATOMIC_ACQUIRE) < threads; ++turn) {
+        if (turn > 7000) {  // more than a rest takes: threads that rest in turn would make each other late for ever
+            turn = 7000;
             reinterpret_cast<Rest>(rest_address)(1);
         }
 #if defined(__x86_64__)
@@ -30,15 +31,15 @@ _WAIT = """
 
 
 @wp.func_native(_WAIT)
-def _wait(counter: wp.array(dtype=wp.int32), threads: int, rest_address: wp.uint64): ...
+def _wait(counts: wp.array(dtype=wp.int32), index: int, threads: int, rest_address: wp.uint64): ...
 
 
 @functools.cache
 def _wait_kernel() -> wp.Kernel:
     @wp.kernel(module="warpfem.barrier", enable_backward=False)
-    def wait_for_all(counter: wp.array(dtype=wp.int32), threads: int, rest_address: wp.uint64):
+    def wait_for_all(counts: wp.array(dtype=wp.int32), index: int, threads: int, rest_address: wp.uint64):
         """Counts the calling thread, then waits until all are counted: in a loop, then asleep."""
-        _wait(counter, threads, rest_address)
+        _wait(counts, index, threads, rest_address)
 
     return wait_for_all
 
@@ -52,28 +53,29 @@ def _rest_address() -> int:
     return ctypes.cast(function, ctypes.c_void_p).value
 
 
-class Barrier:
-    """A barrier that jobs of a team pass once in each run.
+class Barriers:
+    """Barriers that jobs of a team pass one after another, each once in each run.
 
     Args:
         team: the threads, all of which have to come.
+        count: barriers.
     """
 
-    def __init__(self, team: Team) -> None:
+    def __init__(self, team: Team, count: int) -> None:
         self._team = team
-        self._counter = wp.zeros(1, dtype=wp.int32, device="cpu")
-        self._count = self._counter.numpy()
+        self._counts = wp.zeros(count, dtype=wp.int32, device="cpu")
+        self._on_host = self._counts.numpy()
         self._rest = wp.uint64(_rest_address())
 
-    def record(self) -> wp.Launch:
-        """The launch that waits."""
-        inputs = [self._counter, self._team.size, self._rest]
+    def record(self, index: int) -> wp.Launch:
+        """The launch that waits at a barrier."""
+        inputs = [self._counts, index, self._team.size, self._rest]
         return wp.launch(_wait_kernel(), 1, inputs=inputs, device="cpu", record_cmd=True)
 
     def run(self, jobs: Sequence[Job]) -> None:
-        """Runs the jobs of all threads, each of which launches the wait; none waits for one that has raised."""
-        self._count[0] = 0
+        """Runs the jobs of all threads, each of which launches the waits; none waits for one that has raised."""
+        self._on_host[:] = 0
         self._team.run(jobs, self._release)
 
     def _release(self) -> None:
-        self._count[0] = RELEASED
+        self._on_host[:] = RELEASED

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import warp as wp
@@ -94,6 +94,29 @@ class Recordings:
         return self._recorded[key]
 
 
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """A job that launches a graph.
+
+    Attributes:
+        graph: what has been captured.
+        held: what else the graph needs, since it knows arrays by their addresses alone.
+    """
+
+    graph: wp.Graph
+    held: object
+
+    def __call__(self) -> None:
+        wp.capture_launch(self.graph)
+
+
+def captured(launch: Job, around: AbstractContextManager) -> Replay:
+    """What ``launch`` launches on the CPU, and ``around`` before and after it, as a graph."""
+    with wp.ScopedCapture(device="cpu") as capture, around:
+        launch()
+    return Replay(capture.graph, around)
+
+
 def jobs(
     launches: Sequence[Iterable[wp.Launch | None]],
     context: Callable[[], AbstractContextManager] = nullcontext,
@@ -117,7 +140,7 @@ def jobs(
             return launch
         with wp.ScopedCapture(device=own[0].device) as capture:  # a graph takes Python's lock once, which others want
             launch()
-        return functools.partial(wp.capture_launch, capture.graph)
+        return Replay(capture.graph, around)
 
     return [
         job([each for each in own if each is not None], context() if thread else nullcontext())

@@ -260,15 +260,17 @@ class Simulation:
     def _advance(self, end: float) -> None:
         """Steps to the end of a frame."""
         if self._rest_limit is None and not self.stepper.controls_error:
-            for _ in range(self.steps_per_frame):
-                self._step()
+            left = self.steps_per_frame
+            while left:
+                left -= self._take_steps(left)
             self.state.time = end  # without the rounding of many steps
             return
         while end - self.state.time > 1e-9 / self.scene.fps:
             self.step_towards(end)
 
     def step_towards(self, end: float) -> None:
-        """Takes the next step, of the length that the scene asks for, but not beyond the time ``end`` [s].
+        """Takes the next step, of the length that the scene asks for, but not beyond the time ``end`` [s]; or some of
+        them, where steps of the same length are taken several at a time.
 
         Raises:
             SimulationError: the run cannot go on.
@@ -289,7 +291,9 @@ class Simulation:
             parts = math.ceil(left / (AUTO_FRACTION * summary.stable_dt) - 1e-9)
             if not math.isclose(left / parts, self.dt, rel_tol=SAME_DT):
                 self._set_dt(left / parts)
-        self._step()
+            self._take_steps(min(parts, AUTO_INTERVAL - summary.steps % AUTO_INTERVAL))
+            return
+        self._take_steps(1)
 
     def _set_dt(self, dt: float) -> None:
         self.dt = self.summary.dt = dt
@@ -308,15 +312,18 @@ class Simulation:
                 "Take BackwardEuler, or meshes and materials that are squashed less"
             )
 
-    def _step(self) -> None:
-        self._count(self.stepper.step(self.state, self.dt))
+    def _take_steps(self, most: int) -> int:
+        """Takes at most so many steps of the current length; returns how many."""
+        steps, report = self.stepper.advance(self.state, self.dt, most)
+        self._count(report, steps)
+        return steps
 
-    def _count(self, report: StepReport) -> None:
-        """Takes a step of the current length into account."""
+    def _count(self, report: StepReport, steps: int = 1) -> None:
+        """Takes steps of the current length into account."""
         summary = self.summary
         summary.shortest_dt = min(self.dt, summary.shortest_dt or self.dt)
         summary.longest_dt = max(self.dt, summary.longest_dt)
-        summary.steps += 1
+        summary.steps += steps
         summary.simulated_seconds = self.state.time
         summary.newton_iterations += report.newton_iterations
         summary.cg_iterations += report.cg_iterations

@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warpfem.barrier import Barrier
+from warpfem.barrier import Barriers
 from warpfem.dtypes import types
 from warpfem.elements import ElementKernels
 from warpfem.launches import Recordings, jobs
@@ -379,7 +379,7 @@ class VectorizedForce:
         launches = [[launch] for launch in self.record(u, force_out)]
         if size == 1:
             return self._team.run, jobs(launches, as_graphs=False)
-        barrier = Barrier(self._team)
+        barriers = Barriers(self._team, 1)
         for own, points in zip(launches, share(len(force_out), size), strict=True):
-            own += [barrier.record(), self.record_aside(force_out, points)]
-        return barrier.run, jobs(launches)
+            own += [barriers.record(0), self.record_aside(force_out, points)]
+        return barriers.run, jobs(launches)

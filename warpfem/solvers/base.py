@@ -86,6 +86,17 @@ class Stepper(ABC):
                 blown up, and the state shows it.
         """
 
+    def advance(self, state: State, dt: float, most: int) -> tuple[int, StepReport]:
+        """Takes as many steps of ``dt`` [s] as are taken at a time, at least 1 and at most ``most``.
+
+        Returns:
+            How many there were, and their report.
+
+        Raises:
+            SimulationError: as :meth:`step`.
+        """
+        return 1, self.step(state, dt)
+
     def try_step(self, state: State, dt: float) -> StepReport:
         """Advances ``state`` by ``dt`` [s] if the error of the step is within its target, else leaves it as it was.
 

@@ -3,17 +3,17 @@
 import functools
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from warpfem.barrier import Barrier
+from warpfem.barrier import Barriers
 from warpfem.dtypes import types
 from warpfem.errors import SimulationError, TimeStepError
-from warpfem.launches import Recordings, jobs
+from warpfem.launches import Recordings, captured, jobs
 from warpfem.model import Model, State
 from warpfem.points import CHUNK
 from warpfem.profiling import observing
@@ -30,11 +30,15 @@ VECTORIZED_CELLS = 1024
 """Cells of a material, quadratic ones counted by their quadrature points, from which on its forces are computed several
 cells at a time: that takes some seconds to compile once, and work to prepare."""
 
+TOGETHER = 8
+"""Most steps that are launched as one graph: the detour through Python takes as long as the forces of some thousand
+cells, and that of handing work to other threads as long as those of some ten thousand."""
+
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
 
 
-KickDrift = Callable[..., wp.Launch | None]
+KickDrift = Callable[[State, range, wp.array], wp.Launch | None]
 
 
 @functools.cache
@@ -49,16 +53,20 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
         points_per_task: int,
         force: wp.array(dtype=vector),
         inverse_mass: wp.array(dtype=scalar),
-        decay: scalar,
-        kick: scalar,
-        drift: scalar,
-        watched_speed: scalar,
+        settings: wp.array(dtype=scalar),
         u_out: wp.array(dtype=vector),
         v_out: wp.array(dtype=vector),
         alarm_out: wp.array(dtype=wp.int32),
     ):
-        """v = decay v + kick f / m, then u += drift v of some points; an alarm where |v| is not below a limit."""
+        """v = decay v + kick f / m, then u += drift v of some points; an alarm where |v| is not below a limit.
+
+        These numbers are in an array, so that what has been recorded serves for steps of any length.
+        """
         start = first + wp.tid() * points_per_task
+        decay = settings[0]
+        kick = settings[1]
+        drift = settings[2]
+        watched_speed = settings[3]
         forces = wp.array(ptr=force.ptr, shape=(0,), dtype=vector)  # views with a stride known at compile time, which
         inverse = wp.array(ptr=inverse_mass.ptr, shape=(0,), dtype=scalar)  # spare a multiplication at each access
         u = wp.array(ptr=u_out.ptr, shape=(0,), dtype=vector)
@@ -76,23 +84,25 @@ def _kick_drift_kernel(dim: int, dtype: str) -> wp.Kernel:
 
 
 class _Passes:
-    """A step of vectorised bodies as two passes of recorded launches, each divided among threads.
+    """The forces of vectorised bodies, and the move of the points that follows, divided among threads.
 
-    The first computes the forces of the cells and sums them for each point, but for points that threads have in common;
-    the second adds the forces on those, and moves the points. In between, the threads wait for one another. Which
-    thread does what changes no bit of the result.
+    Each thread computes the forces of its cells and sums them for each point, but for points that threads have in
+    common; once all are done, it adds the forces on those among its points, and moves its points. Which thread does
+    what changes no bit of the result.
     """
 
     def __init__(self, model: Model, force: wp.array) -> None:
+        self._model, self._force = model, force
         self._forces = [block.vectorized for block in model.blocks]
-        self._force = force
-        self._team = model.team
-        self._barrier = Barrier(self._team) if self._team.size > 1 else None
-        self._points = share(model.point_count, self._team.size, CHUNK)
-        self._recordings, self._steps = Recordings(), Recordings()
+        self._points = share(model.point_count, model.team.size, CHUNK)
+        self._barriers = Barriers(model.team, 3 * TOGETHER) if model.team.size > 1 else None
+        self._flushed = [SubnormalsFlushed() for _ in self._points]
+        self._passed = 0  # barriers, in what is captured
+        self._others: list[list[wp.Launch]] | None = None  # what is captured of threads other than the calling one
+        self._recordings = Recordings()
 
-    def run(self, kick_drift: KickDrift, state: State, *settings: float) -> None:
-        """Takes the step.
+    def run(self, kick_drift: KickDrift, state: State, settings: wp.array) -> None:
+        """Takes the forces of the state, then moves the points.
 
         Args:
             kick_drift: what launches the move, :meth:`_ExplicitStepper._record_kick_drift`; not kept, because a stepper
@@ -100,31 +110,59 @@ class _Passes:
             state: the state.
             settings: of the move.
         """
-        key = (state.u.ptr, state.v.ptr, *settings)
-        work = self._steps.get(key, lambda: self._record(kick_drift, state, *settings))
-        (self._team if self._barrier is None else self._barrier).run(work)
+        key = (state.u.ptr, state.v.ptr, settings.ptr)
+        forces, moves = self._recordings.get(key, lambda: self._record(kick_drift, state, settings))
+        if self._others is not None:
+            self._divide(state, forces, moves)
+            return
+        self._model.external_force(state.u, self._force)
+        if self._barriers is None:
+            _launch_all(forces[0] + moves[0])
+        else:
+            wait = self._barriers.record(0)
+            launches = [[*first, wait, *then] for first, then in zip(forces, moves, strict=True)]
+            self._barriers.run(jobs(launches, SubnormalsFlushed, as_graphs=False))
 
-    def _record(self, kick_drift: KickDrift, state: State, *settings: float) -> list[Job]:
-        forces = self._recordings.get((state.u.ptr,), lambda: self._record_forces(state.u))
-        moves = [[kick_drift(state, points, *settings)] for points in self._points]
-        pairs = zip(forces, jobs(moves, SubnormalsFlushed, as_graphs=False), strict=True)
-        return [functools.partial(_in_turn, *pair) for pair in pairs]
+    def _divide(self, state: State, forces: list[list[wp.Launch]], moves: list[list[wp.Launch]]) -> None:
+        """The same in what is captured: launched by the calling thread as far as it is its part, listed for others."""
+        first, middle, last = (self._barriers.record(self._passed + k) for k in range(3))
+        self._passed += 3
+        self._model.external_force(state.u, self._force)
+        own, *others = [[first, *f, middle, *m, last] for f, m in zip(forces, moves, strict=True)]
+        _launch_all(own)
+        for listed, launches in zip(self._others, others, strict=True):
+            listed += launches
 
-    def _record_forces(self, u: wp.array) -> list[Job]:
-        launches: list[list[wp.Launch | None]] = [[] for _ in self._points]
-        for force in self._forces:
-            for all_own, own in zip(launches, force.record(u, self._force), strict=True):
-                all_own.append(own)
-        if self._barrier is not None:
-            for own, points in zip(launches, self._points, strict=True):
-                own.append(self._barrier.record())
-                own.extend(force.record_aside(self._force, points) for force in self._forces)
-        return jobs(launches, SubnormalsFlushed, as_graphs=self._team.size > 1)  # else the whole step is one
+    def _record(
+        self, kick_drift: KickDrift, state: State, settings: wp.array
+    ) -> tuple[list[list[wp.Launch]], list[list[wp.Launch]]]:
+        """The launches of each thread up to where all wait for one another, and those after."""
+        forces = zip(*(force.record(state.u, self._force) for force in self._forces), strict=True)
+        moves = (
+            [*(force.record_aside(self._force, points) for force in self._forces), kick_drift(state, points, settings)]
+            for points in self._points
+        )
+        first, second = ([[one for one in own if one is not None] for own in every] for every in (forces, moves))
+        return first, second
+
+    def capture(self, launch: Job) -> Job:
+        """What does again what ``launch`` does, with all threads."""
+        self._passed = 0
+        if self._barriers is None:
+            return captured(launch, self._flushed[0])
+        self._others = [[] for _ in self._points[1:]]
+        try:
+            work = [captured(launch, self._flushed[0])]
+            for own, flushed in zip(self._others, self._flushed[1:], strict=True):
+                work.append(captured(functools.partial(_launch_all, own), flushed))
+        finally:
+            self._others = None
+        return functools.partial(self._barriers.run, work)
 
 
-def _in_turn(first: Job, second: Job) -> None:
-    first()
-    second()
+def _launch_all(launches: Iterable[wp.Launch]) -> None:
+    for launch in launches:
+        launch.launch()
 
 
 class _ExplicitStepper(Stepper):
@@ -148,35 +186,63 @@ class _ExplicitStepper(Stepper):
             self._passes = _Passes(model, self._force)
         self._flushed = SubnormalsFlushed() if model.device.is_cpu else nullcontext()
         alone = model.team.size == 1 or not any(block.vectorized for block in model.blocks)
-        self._as_graph = model.device.is_cpu and alone
+        self._as_graph = model.device.is_cpu and (alone or self._passes is not None)
         self._launched: Hashable = None  # what the last step's launches were made for
         self._graphs = Recordings()
+        self._settings: dict[tuple[float, float], wp.array] = {}
+        self._set_for: tuple[float, float] | None = None
         self._inverse_mass = self._free_inverse_mass()
         self._recordings = Recordings()
 
     def step(self, state: State, dt: float) -> StepReport:
-        self._begin(state, dt)
-        self._advance(state, dt)
-        state.time += dt
-        state.revision += 1
-        self._look(state, dt)
-        return StepReport()
+        return self.advance(state, dt, 1)[1]
 
-    def _advance(self, state: State, dt: float) -> None:
-        """Launches the step; on one thread as a graph if the last one was the same, which costs bodies of a thousand
-        cells a quarter of the time that launching one kernel after another takes."""
-        made_for = (state.u.ptr, state.v.ptr, dt, self._watched_speed)
+    def advance(self, state: State, dt: float, most: int) -> tuple[int, StepReport]:
+        self._begin(state, dt)
+        count = self._advance(state, dt, most)
+        for _ in range(count):
+            state.time += dt
+        state.revision += count
+        self._look(state, dt, count)
+        return count, StepReport()
+
+    def _advance(self, state: State, dt: float, most: int) -> int:
+        """Launches steps, and returns how many: as a graph if the last one was alike, which costs bodies of a thousand
+        cells a quarter of the time that launching one kernel after another takes, and several at a time still less."""
+        self._set(dt)
+        made_for = (state.u.ptr, state.v.ptr, dt if self._rough else None)
         if not self._as_graph or observing() or made_for != self._launched:
             self._launched = made_for
             with self._flushed:
                 self._launch(state, dt)
-        else:
-            wp.capture_launch(self._graphs.get(made_for, lambda: self._capture(state, dt)))
+            return 1
+        moving = self.model.supports is not None and self.model.supports.moving
+        together = 1 if moving else min(most, TOGETHER, self._interval - self._steps % self._interval)
+        count = 1 << together.bit_length() - 1  # a power of two, so that a few graphs will do
+        self._graphs.get((*made_for, count), lambda: self._capture(state, dt, count))()
+        return count
 
-    def _capture(self, state: State, dt: float) -> wp.Graph:
-        with wp.ScopedCapture(device=self.model.device) as capture, self._flushed:
-            self._launch(state, dt)
-        return capture.graph
+    def _capture(self, state: State, dt: float, count: int) -> Job:
+        def launch() -> None:
+            for _ in range(count):
+                self._launch(state, dt)
+
+        return captured(launch, self._flushed) if self._passes is None else self._passes.capture(launch)
+
+    def _set(self, dt: float) -> None:
+        """Brings the settings of moves up to date."""
+        if self._set_for != (dt, self._watched_speed):
+            self._set_for = dt, self._watched_speed
+            for (kick, drift), settings in self._settings.items():
+                settings.assign([*self._impulse(kick * dt), drift * dt, self._watched_speed])
+
+    def _settings_of(self, kick: float, drift: float) -> wp.array:
+        """The settings of a move, in parts of dt: what is left of the velocity, kick, drift, and speed watched for."""
+        if (kick, drift) not in self._settings:
+            self._settings[kick, drift] = wp.zeros(4, dtype=self.model.types.scalar, device=self.model.device)
+            dt, self._set_for = self._set_for[0], None
+            self._set(dt)
+        return self._settings[kick, drift]
 
     @abstractmethod
     def _launch(self, state: State, dt: float) -> None:
@@ -231,9 +297,9 @@ class _ExplicitStepper(Stepper):
                 f'{self._limit:.4g} s: take a smaller dt, dt="auto", or BackwardEuler'
             )
 
-    def _look(self, state: State, dt: float) -> None:
+    def _look(self, state: State, dt: float, count: int) -> None:
         """Now and then, and where points have become faster than ever, looks whether the run is still stable."""
-        self._steps += 1
+        self._steps += count
         self._seen = (state, state.revision)
         if self._alarmed():
             self._alarm.zero_()
@@ -263,14 +329,13 @@ class _ExplicitStepper(Stepper):
             if kick or drift:
                 self._kick_drift(state, kick, drift)
             return
-        self.model.external_force(state.u, self._force)
-        self._passes.run(self._record_kick_drift, state, *self._impulse(kick), drift, self._watched_speed)
+        self._passes.run(self._record_kick_drift, state, self._settings_of(kick, drift))
 
     def _kick_drift(self, state: State, kick: float, drift: float) -> None:
-        """Lets forces and damping act for a time, as v' = f / m - alpha v has it, then moves for another."""
-        points, settings = range(self.model.point_count), (*self._impulse(kick), drift, self._watched_speed)
-        key = (state.u.ptr, state.v.ptr, *settings)
-        self._recordings.get(key, lambda: self._record_kick_drift(state, points, *settings)).launch()
+        """Lets forces and damping act for a part of dt, as v' = f / m - alpha v has it, then moves for another."""
+        points, settings = range(self.model.point_count), self._settings_of(kick, drift)
+        key = (state.u.ptr, state.v.ptr, settings.ptr)
+        self._recordings.get(key, lambda: self._record_kick_drift(state, points, settings)).launch()
 
     def _impulse(self, kick: float) -> tuple[float, float]:
         """What is left of the velocity after a time, and the time for which the force counts."""
@@ -279,24 +344,12 @@ class _ExplicitStepper(Stepper):
             return 1.0, kick
         return math.exp(-alpha * kick), -math.expm1(-alpha * kick) / alpha
 
-    def _record_kick_drift(
-        self, state: State, points: range, decay: float, kick: float, drift: float, speed: float
-    ) -> wp.Launch | None:
+    def _record_kick_drift(self, state: State, points: range, settings: wp.array) -> wp.Launch | None:
         per_task = CHUNK if self.model.device.is_cpu else 1  # a GPU has a thread for each
         return wp.launch(
             self._kernel,
             -(-len(points) // per_task),
-            inputs=[
-                points.start,
-                points.stop,
-                per_task,
-                self._force,
-                self._inverse_mass,
-                decay,
-                kick,
-                drift,
-                speed,
-            ],
+            inputs=[points.start, points.stop, per_task, self._force, self._inverse_mass, settings],
             outputs=[state.u, state.v, self._alarm],
             device=self.model.device,
             record_cmd=True,
@@ -321,11 +374,11 @@ class _ExplicitStepper(Stepper):
 class _SymplecticEulerStepper(_ExplicitStepper):
     def _launch(self, state: State, dt: float) -> None:
         if self._rough:  # friction acts between the new velocity and the drift
-            self._evaluate(state, dt, 0.0)
+            self._evaluate(state, 1.0, 0.0)
             self._rub(state, dt)
-            self._kick_drift(state, 0.0, dt)
+            self._kick_drift(state, 0.0, 1.0)
         else:
-            self._evaluate(state, dt, dt)
+            self._evaluate(state, 1.0, 1.0)
         self._hold(state)
 
 
@@ -334,24 +387,25 @@ class _VelocityVerletStepper(_ExplicitStepper):
         super().__init__(model)
         self._known: tuple[State, int] | None = None  # state and revision that the force belongs to
 
-    def _advance(self, state: State, dt: float) -> None:
+    def _advance(self, state: State, dt: float, most: int) -> int:
         if self._known is None or self._known[0] is not state or self._known[1] != state.revision:
+            self._set(dt)
             with self._flushed:
                 self._evaluate(state)
-        super()._advance(state, dt)
-        self._known = (state, state.revision + 1)
+        count = super()._advance(state, dt, most)
+        self._known = (state, state.revision + count)
+        return count
 
     def _launch(self, state: State, dt: float) -> None:
-        half = 0.5 * dt
         if self._rough:
-            self._kick_drift(state, half, 0.0)
-            self._rub(state, half)
-            self._kick_drift(state, 0.0, dt)
+            self._kick_drift(state, 0.5, 0.0)
+            self._rub(state, 0.5 * dt)
+            self._kick_drift(state, 0.0, 1.0)
         else:
-            self._kick_drift(state, half, dt)
+            self._kick_drift(state, 0.5, 1.0)
         self._hold(state)
-        self._evaluate(state, half, 0.0)
-        self._rub(state, half)
+        self._evaluate(state, 0.5, 0.0)
+        self._rub(state, 0.5 * dt)
         self._hold(state)
 
 
