@@ -1,6 +1,7 @@
 """Forces of several cells at a time: those of one at a time, with the same bits on any number of threads."""
 
 import dataclasses
+import functools
 import gc
 import signal
 import threading
@@ -201,6 +202,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, solver):
         monkeypatch.setattr(module, "VECTORIZED_CELLS", 64)
     monkeypatch.setattr("warpfem.model.CELLS_PER_THREAD", 256)
     monkeypatch.setattr("warpfem.row_blocks.BLOCK", 1)
+    monkeypatch.setattr(explicit, "RECORDING", 1)
     monkeypatch.setattr("warpfem.linear.cell_sums.GROUP_BLOCKS", 640)
     monkeypatch.setattr("warpfem.linear.operators.SLICED_POINTS", 64)
     monkeypatch.setattr("warpfem.linear.slices.SLICES_PER_THREAD", 1)
@@ -314,9 +316,9 @@ def test_a_team_runs_all_jobs_and_passes_on_a_failure():
 def test_no_thread_passes_a_barrier_before_all_have_come():
     """With more threads than most machines for tests have cores."""
     barriers, seen = Barriers(Team(5), 2), []
-    first, second = barriers.record(0), barriers.record(1)
+    waits = [[barriers.record(index, thread) for index in range(2)] for thread in range(5)]
 
-    def work():
+    def work(first, second):
         seen.append("before")
         first.launch()
         seen.append("between")
@@ -324,7 +326,7 @@ def test_no_thread_passes_a_barrier_before_all_have_come():
         seen.append("after")
 
     for _ in range(20):
-        barriers.run([work] * 5)
+        barriers.run([functools.partial(work, *own) for own in waits])
     assert seen == (["before"] * 5 + ["between"] * 5 + ["after"] * 5) * 20
 
 
@@ -332,15 +334,15 @@ def test_no_thread_passes_a_barrier_before_all_have_come():
 @pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
 def test_a_thread_that_fails_holds_no_other_at_a_barrier(failing, failure):
     barriers = Barriers(Team(3), 1)
-    wait = barriers.record(0)
+    waits = [barriers.record(0, thread) for thread in range(3)]
 
     def fail():
         time.sleep(0.01)
         raise failure("a job")
 
     with pytest.raises(failure, match="a job"):
-        barriers.run([fail if thread == failing else wait.launch for thread in range(3)])
-    barriers.run([wait.launch] * 3)
+        barriers.run([fail if thread == failing else waits[thread].launch for thread in range(3)])
+    barriers.run([wait.launch for wait in waits])
 
 
 @pytest.mark.usefixtures("interrupts")

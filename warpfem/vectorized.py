@@ -380,6 +380,6 @@ class VectorizedForce:
         if size == 1:
             return self._team.run, jobs(launches, as_graphs=False)
         barriers = Barriers(self._team, 1)
-        for own, points in zip(launches, share(len(force_out), size), strict=True):
-            own += [barriers.record(0), self.record_aside(force_out, points)]
+        for thread, (own, points) in enumerate(zip(launches, share(len(force_out), size), strict=True)):
+            own += [barriers.record(0, thread), self.record_aside(force_out, points)]
         return barriers.run, jobs(launches)

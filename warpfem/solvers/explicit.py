@@ -30,9 +30,15 @@ VECTORIZED_CELLS = 1024
 """Cells of a material, quadratic ones counted by their quadrature points, from which on its forces are computed several
 cells at a time: that takes some seconds to compile once, and work to prepare."""
 
-TOGETHER = 8
+TOGETHER = 16
 """Most steps that are launched as one graph: the detour through Python takes as long as the forces of some thousand
 cells, and that of handing work to other threads as long as those of some ten thousand."""
+
+RECORDING = 300_000
+"""Cells, in all steps alike so far, for each step of a graph that is made: ten times the work that making it takes."""
+
+LAUNCHING = 1000
+"""Cells whose forces take as long as the launches of a step."""
 
 ALARM_INTERVAL = 16
 """Steps after which a device other than the CPU is asked for alarms."""
@@ -119,19 +125,21 @@ class _Passes:
         if self._barriers is None:
             _launch_all(forces[0] + moves[0])
         else:
-            wait = self._barriers.record(0)
-            launches = [[*first, wait, *then] for first, then in zip(forces, moves, strict=True)]
+            parts = enumerate(zip(forces, moves, strict=True))
+            launches = [[*first, self._barriers.record(0, thread), *then] for thread, (first, then) in parts]
             self._barriers.run(jobs(launches, SubnormalsFlushed, as_graphs=False))
 
     def _divide(self, state: State, forces: list[list[wp.Launch]], moves: list[list[wp.Launch]]) -> None:
         """The same in what is captured: launched by the calling thread as far as it is its part, listed for others."""
-        first, middle, last = (self._barriers.record(self._passed + k) for k in range(3))
-        self._passed += 3
         self._model.external_force(state.u, self._force)
-        own, *others = [[first, *f, middle, *m, last] for f, m in zip(forces, moves, strict=True)]
-        _launch_all(own)
-        for listed, launches in zip(self._others, others, strict=True):
-            listed += launches
+        for thread, (before, after) in enumerate(zip(forces, moves, strict=True)):
+            first, middle, last = (self._barriers.record(self._passed + k, thread) for k in range(3))
+            launches = [first, *before, middle, *after, last]
+            if thread == 0:
+                _launch_all(launches)
+            else:
+                self._others[thread - 1] += launches
+        self._passed += 3
 
     def _record(
         self, kick_drift: KickDrift, state: State, settings: wp.array
@@ -188,6 +196,7 @@ class _ExplicitStepper(Stepper):
         alone = model.team.size == 1 or not any(block.vectorized for block in model.blocks)
         self._as_graph = model.device.is_cpu and (alone or self._passes is not None)
         self._launched: Hashable = None  # what the last step's launches were made for
+        self._alike = 0  # steps since that is so
         self._graphs = Recordings()
         self._settings: dict[tuple[float, float], wp.array] = {}
         self._set_for: tuple[float, float] | None = None
@@ -212,15 +221,22 @@ class _ExplicitStepper(Stepper):
         self._set(dt)
         made_for = (state.u.ptr, state.v.ptr, dt if self._rough else None)
         if not self._as_graph or observing() or made_for != self._launched:
-            self._launched = made_for
+            self._launched, self._alike = made_for, 1
             with self._flushed:
                 self._launch(state, dt)
             return 1
-        moving = self.model.supports is not None and self.model.supports.moving
-        together = 1 if moving else min(most, TOGETHER, self._interval - self._steps % self._interval)
-        count = 1 << together.bit_length() - 1  # a power of two, so that a few graphs will do
+        count = self._together(most)
+        self._alike += count
         self._graphs.get((*made_for, count), lambda: self._capture(state, dt, count))()
         return count
+
+    def _together(self, most: int) -> int:
+        """How many steps to take at a time: a power of two, so that a few graphs will do."""
+        if self.model.supports is not None and self.model.supports.moving:
+            return 1
+        paid = self._alike * (self.model.cell_count + LAUNCHING) // RECORDING
+        most = min(most, TOGETHER, self._interval - self._steps % self._interval, max(1, paid))
+        return 1 << most.bit_length() - 1
 
     def _capture(self, state: State, dt: float, count: int) -> Job:
         def launch() -> None:
