@@ -13,15 +13,15 @@ import numpy as np
 import warp as wp
 
 from warpfem.dtypes import types
-from warpfem.packed_points import packed_size
+from warpfem.packed_points import LANES, packed_size
 from warpfem.threads import share
 
-CHUNK = 64
-"""Rows that are taken in one loop: their forces (4.6 kB of strips, in single precision) fit the first-level cache with
-all else."""
+CHUNK = LANES
+"""Rows that are taken side by side. What they have of their cells is one stretch of memory, which processors fetch
+ahead: with four times as many rows, steps of a million cells take half as long again."""
 
-BLOCK = 16
-"""Most chunks of a block: with 8 more shares are to be added, with 64 threads have less equal work."""
+BLOCK = 64
+"""Most chunks of a block: what it has of points fits the first two caches."""
 
 
 @functools.cache

@@ -2,6 +2,9 @@
 
 import platform
 
+MAX_UNROLL = 12
+"""Longest loops that Warp may write out: over points of a cell and components, but not over lanes."""
+
 
 def compiler_flags(depth: int, *others: str, inlined: int = 9000) -> str:
     """Warp's own flags with fused multiply-adds, the widest registers, and a depth for straight-line vector code.

@@ -29,7 +29,7 @@ from warpfem.shapes import Shape
 from warpfem.strips import STRIP, cut_into_strips, order_in_space
 from warpfem.tensor import select
 from warpfem.threads import Job, Team, share
-from warpfem.vector_code import compiler_flags
+from warpfem.vector_code import MAX_UNROLL, compiler_flags
 
 
 class Row:
@@ -187,9 +187,12 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
                             f[entry + i * wp.static(CHUNK)] += weight[k * wp.static(dim) + a, n] * share[i]
             k += 1
 
-    flags = compiler_flags(4, "runtime-memory-check-threshold=64", inlined=30000)
+    options = {
+        "max_unroll": MAX_UNROLL,
+        "cpu_compiler_flags": compiler_flags(4, "runtime-memory-check-threshold=64", inlined=30000),
+    }
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def block_force(
         first: int,
         chunk_starts: wp.array(dtype=wp.int32),

@@ -17,7 +17,7 @@ from warpfem.packed_points import packed_point_functions
 from warpfem.row_blocks import CHUNK
 from warpfem.shapes import Shape
 from warpfem.tensor import deformation_gradient, direct_rotation
-from warpfem.vector_code import compiler_flags
+from warpfem.vector_code import MAX_UNROLL, compiler_flags
 from warpfem.vectorized import Readers, Row
 
 ROUNDS = 3
@@ -75,7 +75,7 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
     values_of_rows = wp.types.vector(length=CHUNK, dtype=scalar)
     pack, load_rows = packed.pack, packed.load_rows
     tangent, differential = _rule(constitutive, dim, dtype)
-    flags = compiler_flags(4, inlined=30000)
+    options = {"max_unroll": MAX_UNROLL, "cpu_compiler_flags": compiler_flags(4, inlined=30000)}
 
     @wp.func
     def largest_square(x: row_vectors, B: wp.array(dtype=scalar), p: wp.array(dtype=scalar), lane: int):
@@ -110,7 +110,7 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
             largest = wp.where(square <= largest, largest, square)  # not a number stays
         return largest, known
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def strip_frequency(
         first: int,
         chunk_starts: wp.array(dtype=wp.int32),
