@@ -49,7 +49,7 @@ def _transposed(size: int) -> list[str]:
     if size == 2:
         return [picked("z[0]", "z[1]", [i, 2 + i]) for i in range(2)]
     pairs = [picked(f"z[{a}]", f"z[{a + 1}]", [h, 4 + h, h + 1, 5 + h]) for h in (0, 2) for a in (0, 2)]
-    return [picked(*pairs[h : h + 2], [i, i + 1, 4 + i, 5 + i]) for h in (0, 2) for i in (0, 2)]
+    return [picked(pairs[h], pairs[h + 1], [i, i + 1, 4 + i, 5 + i]) for h in (0, 2) for i in (0, 2)]
 
 
 @functools.cache

@@ -27,8 +27,9 @@ def setup(problem, options):
 
         def advance(duration):
             try:
-                for _ in range(steps):
-                    simulation.stepper.step(states[0], duration / steps)
+                left = steps
+                while left:
+                    left -= simulation.stepper.advance(states[0], duration / steps, left)[0]
             except wf.SimulationError:
                 return np.array(np.nan)
             return states[0].displacement
