@@ -533,12 +533,17 @@ class Model:
 
     def external_force(self, u: wp.array, force_out: wp.array) -> None:
         """Overwrites ``force_out`` with dead loads and the forces of obstacles [N]."""
-        if self.dead_load is None:
-            force_out.zero_()
-        else:
-            wp.copy(force_out, self.dead_load)
+        self.reset_force(force_out, range(self.point_count))
         if self.contact is not None:
             self.contact.add_force(u, force_out)
+
+    def reset_force(self, force_out: wp.array, points: range) -> None:
+        """Overwrites ``force_out`` with dead loads [N] on a range of points."""
+        own = slice(points.start, points.stop)
+        if self.dead_load is None:
+            force_out[own].zero_()
+        else:
+            wp.copy(force_out[own], self.dead_load[own])
 
     def vectorize(self, least: int) -> None:
         """Prepares the forces of steps on the CPU: of several cells at a time, where a material has ``least`` of them.

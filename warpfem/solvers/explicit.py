@@ -30,9 +30,12 @@ VECTORIZED_CELLS = 1024
 """Cells of a material, quadratic ones counted by their quadrature points, from which on its forces are computed several
 cells at a time: that takes some seconds to compile once, and work to prepare."""
 
-TOGETHER = 16
+TOGETHER = 32
 """Most steps that are launched as one graph: the detour through Python takes as long as the forces of some thousand
 cells, and that of handing work to other threads as long as those of some ten thousand."""
+
+BARRIERS = 5
+"""Where threads wait for one another in a step: for what the calling thread does alone, and between the parts."""
 
 RECORDING = 300_000
 """Cells, in all steps alike so far, for each step of a graph that is made: ten times the work that making it takes."""
@@ -101,10 +104,10 @@ class _Passes:
         self._model, self._force = model, force
         self._forces = [block.vectorized for block in model.blocks]
         self._points = share(model.point_count, model.team.size, CHUNK)
-        self._barriers = Barriers(model.team, 3 * TOGETHER) if model.team.size > 1 else None
+        self._barriers = Barriers(model.team, BARRIERS * TOGETHER) if model.team.size > 1 else None
         self._flushed = [SubnormalsFlushed() for _ in self._points]
         self._passed = 0  # barriers, in what is captured
-        self._others: list[list[wp.Launch]] | None = None  # what is captured of threads other than the calling one
+        self._others: list[list[Job]] | None = None  # what is captured of threads other than the calling one
         self._recordings = Recordings()
 
     def run(self, kick_drift: KickDrift, state: State, settings: wp.array) -> None:
@@ -123,7 +126,7 @@ class _Passes:
             return
         self._model.external_force(state.u, self._force)
         if self._barriers is None:
-            _launch_all(forces[0] + moves[0])
+            _run_all(launch.launch for launch in forces[0] + moves[0])
         else:
             parts = enumerate(zip(forces, moves, strict=True))
             launches = [[*first, self._barriers.record(0, thread), *then] for thread, (first, then) in parts]
@@ -131,15 +134,20 @@ class _Passes:
 
     def _divide(self, state: State, forces: list[list[wp.Launch]], moves: list[list[wp.Launch]]) -> None:
         """The same in what is captured: launched by the calling thread as far as it is its part, listed for others."""
-        self._model.external_force(state.u, self._force)
-        for thread, (before, after) in enumerate(zip(forces, moves, strict=True)):
-            first, middle, last = (self._barriers.record(self._passed + k, thread) for k in range(3))
-            launches = [first, *before, middle, *after, last]
+        model = self._model
+        for thread, points in enumerate(self._points):
+            waits = [self._barriers.record(self._passed + k, thread).launch for k in range(BARRIERS)]
+            work = [waits[0], functools.partial(model.reset_force, self._force, points), waits[1]]
+            if model.contact is not None:
+                touch = functools.partial(model.contact.add_force, state.u, self._force)
+                work += [waits[2]] if thread else [touch, waits[2]]
+            work += [launch.launch for launch in forces[thread]]
+            work += [waits[3], *(launch.launch for launch in moves[thread]), waits[4]]
             if thread == 0:
-                _launch_all(launches)
+                _run_all(work)
             else:
-                self._others[thread - 1] += launches
-        self._passed += 3
+                self._others[thread - 1] += work
+        self._passed += BARRIERS
 
     def _record(
         self, kick_drift: KickDrift, state: State, settings: wp.array
@@ -162,15 +170,15 @@ class _Passes:
         try:
             work = [captured(launch, self._flushed[0])]
             for own, flushed in zip(self._others, self._flushed[1:], strict=True):
-                work.append(captured(functools.partial(_launch_all, own), flushed))
+                work.append(captured(functools.partial(_run_all, own), flushed))
         finally:
             self._others = None
         return functools.partial(self._barriers.run, work)
 
 
-def _launch_all(launches: Iterable[wp.Launch]) -> None:
-    for launch in launches:
-        launch.launch()
+def _run_all(jobs: Iterable[Job]) -> None:
+    for job in jobs:
+        job()
 
 
 class _ExplicitStepper(Stepper):
