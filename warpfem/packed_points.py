@@ -53,11 +53,11 @@ def _transposed(size: int) -> list[str]:
 
 
 @functools.cache
-def packed_point_functions(dim: int, dtype: str, width: int, rows: int) -> SimpleNamespace:
-    """The functions ``pack``, ``load_rows``, ``add_rows`` and ``unpack`` for ``rows`` rows of ``width`` points.
+def packed_point_functions(dim: int, dtype: str, width: int) -> SimpleNamespace:
+    """The functions ``pack``, ``load_rows``, ``add_rows`` and ``unpack`` for ``LANES`` rows of ``width`` points.
 
-    Places of these points among a block's packed ones are listed as (width, rows), the components of what they have as
-    (width, dim, rows).
+    Places of these points among a block's packed ones are listed as (width, LANES), the components of what they have as
+    (width, dim, LANES).
     """
     t = types(dim, dtype)
     scalar, vector = t.scalar, t.vector
@@ -78,15 +78,14 @@ def packed_point_functions(dim: int, dtype: str, width: int, rows: int) -> Simpl
         f"V{LANES} w[] = {{ {', '.join(turned)} }};"
         + "".join(f"points[own[{k}]] += {parts[k]};\n" for k in range(LANES))
     )
-    lists = ", ".join(f"(V{LANES}*)(listed.data + (a * {dim} + {i}) * {rows} + lane)" for i in components)
+    lists = ", ".join(f"(V{LANES}*)(listed.data + (a * {dim} + {i}) * {LANES})" for i in components)
     points = f"{vectors} V{size}* points = (V{size}*)packed.data;"
-    per_lanes = f"""
-        for (int a = 0; a < {width}; ++a)
-            for (int lane = 0; lane < {rows}; lane += {LANES}) {{
-                const wp::uint16* own = row_points.data + first + a * {rows} + lane;
-                V{LANES}* list[] = {{ {lists} }};
-                %s
-            }}"""
+    each = f"""
+        for (int a = 0; a < {width}; ++a) {{
+            const wp::uint16* own = row_points.data + first + a * {LANES};
+            V{LANES}* list[] = {{ {lists} }};
+            %s
+        }}"""
     pack = f"""
         for (int k = begin; k < end; ++k) {{
             const {number}* value = (const {number}*)values.data + {dim} * block_points.data[k];
@@ -116,7 +115,7 @@ def packed_point_functions(dim: int, dtype: str, width: int, rows: int) -> Simpl
     ):
         """Packs the values of the points begin..end of all blocks'."""
 
-    @wp.func_native(points + per_lanes % loaded)
+    @wp.func_native(points + each % loaded)
     def load_rows(
         packed: wp.array(dtype=scalar),
         row_points: wp.array(dtype=wp.uint16),
@@ -125,7 +124,7 @@ def packed_point_functions(dim: int, dtype: str, width: int, rows: int) -> Simpl
     ):
         """Lists the components of the points in places ``first`` and after."""
 
-    @wp.func_native(points + per_lanes % added)
+    @wp.func_native(points + each % added)
     def add_rows(
         listed: wp.array(dtype=scalar),
         row_points: wp.array(dtype=wp.uint16),

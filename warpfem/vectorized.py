@@ -114,7 +114,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
     read = Readers(constitutive.parameter_count, dim, dtype, uniform)
     view, read_gradients, read_parameters = read.view, read.gradients, read.parameters
     parameter_count = constitutive.parameter_count
-    packed = packed_point_functions(dim, dtype, width, CHUNK)
+    packed = packed_point_functions(dim, dtype, width)
     pack, load_rows, add_rows, unpack = packed.pack, packed.load_rows, packed.add_rows, packed.unpack
 
     @wp.func

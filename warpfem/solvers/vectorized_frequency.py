@@ -71,7 +71,7 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
     row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
     read = Readers(constitutive.parameter_count, dim, dtype, uniform)
     view, read_gradients, read_parameters = read.view, read.gradients, read.parameters
-    packed = packed_point_functions(dim, dtype, width, CHUNK)
+    packed = packed_point_functions(dim, dtype, width)
     values_of_rows = wp.types.vector(length=CHUNK, dtype=scalar)
     pack, load_rows = packed.pack, packed.load_rows
     tangent, differential = _rule(constitutive, dim, dtype)
