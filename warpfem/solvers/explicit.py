@@ -37,8 +37,8 @@ cells, and that of handing work to other threads as long as those of some ten th
 BARRIERS = 5
 """Where threads wait for one another in a step: for what the calling thread does alone, and between the parts."""
 
-RECORDING = 300_000
-"""Cells, in all steps alike so far, for each step of a graph that is made: ten times the work that making it takes."""
+RECORDING = 1_000_000
+"""Cells, in all steps alike so far, for each step of a graph that is made: some twenty times the work of making it."""
 
 LAUNCHING = 1000
 """Cells whose forces take as long as the launches of a step."""
