@@ -65,9 +65,10 @@ class Row:
 class Readers:
     """Kernel functions that read what the rows of a chunk have from blocked arrays."""
 
-    def __init__(self, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
+    def __init__(self, width: int, parameter_count: int, dim: int, dtype: str, uniform: bool) -> None:
         t = types(dim, dtype)
         scalar, matrix = t.scalar, t.matrix
+        row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
         parameter_vector = wp.types.vector(length=parameter_count, dtype=scalar)
 
         @wp.func
@@ -75,6 +76,15 @@ class Readers:
             """A chunk's part of an array that has some entries of each row."""
             offset = wp.uint64(chunk) * wp.uint64(entries * wp.static(CHUNK * t.numpy().itemsize))
             return wp.array(ptr=blocked.ptr + offset, shape=(0,), dtype=scalar)
+
+        @wp.func
+        def row(listed: wp.array(dtype=scalar), lane: int):
+            """The vectors of the points of a row, from the components that ``load_rows`` lists."""
+            value = row_vectors()
+            for a in range(wp.static(width)):
+                for i in range(wp.static(dim)):
+                    value[a, i] = listed[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
+            return value
 
         @wp.func
         def gradients(B: wp.array(dtype=scalar), k: int, lane: int):
@@ -96,7 +106,8 @@ class Readers:
                     value[i] = p[(k * wp.static(parameter_count) + i) * wp.static(CHUNK) + lane]
             return value
 
-        self.view, self.gradients, self.parameters = view, gradients, parameters
+        self.row_vectors = row_vectors
+        self.view, self.row, self.gradients, self.parameters = view, row, gradients, parameters
 
 
 @functools.cache
@@ -108,11 +119,11 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
     points, weights = row.points.tolist(), row.weights.tolist()
     point_table = wp.types.matrix(shape=(places * dim, terms), dtype=wp.int32)(row.points.ravel().tolist())
     weight_table = wp.types.matrix(shape=(places * dim, terms), dtype=scalar)(row.weights.ravel().tolist())
-    row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
     stress, direct_stress = constitutive.stress, constitutive.direct_stress
     direct = direct_stress is not None
-    read = Readers(constitutive.parameter_count, dim, dtype, uniform)
-    view, read_gradients, read_parameters = read.view, read.gradients, read.parameters
+    read = Readers(width, constitutive.parameter_count, dim, dtype, uniform)
+    row_vectors, view, read_row = read.row_vectors, read.view, read.row
+    read_gradients, read_parameters = read.gradients, read.parameters
     parameter_count = constitutive.parameter_count
     packed = packed_point_functions(dim, dtype, width)
     pack, load_rows, add_rows, unpack = packed.pack, packed.load_rows, packed.add_rows, packed.unpack
@@ -229,11 +240,7 @@ def _force_kernel(constitutive: Constitutive, shape: Shape, dtype: str, uniform:
             p = view(parameters, chunk, wp.static(0 if uniform else places * parameter_count))
             known = view(known_out, chunk, 1)
             for lane in range(wp.static(CHUNK)):
-                x = row_vectors()
-                for a in range(wp.static(width)):
-                    for i in range(wp.static(dim)):
-                        x[a, i] = displacements[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
-                f, holds = internal_forces(x, B, volumes, p, lane)
+                f, holds = internal_forces(read_row(displacements, lane), B, volumes, p, lane)
                 for a in range(wp.static(width)):
                     for i in range(wp.static(dim)):
                         forces[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane] = f[a, i]
@@ -262,8 +269,7 @@ class VectorizedForce:
         team: the threads among which :meth:`add` divides its work.
 
     Attributes:
-        chunk_count: chunks of rows.
-        blocks: of these.
+        blocks: of chunks of rows.
         cell_arrays: what the rows have of their cells, by chunk: D_m^-1, volumes and parameters.
         scratch: of each thread: displacements of and forces on a block's points, packed, and those of a chunk's rows.
         uniform: whether all cells have the same parameters.
@@ -297,8 +303,7 @@ class VectorizedForce:
             order = order_in_space(rest_points, host_cells)
             points = host_cells[order]
             quadrature = order[:, None] * shape.quadrature_count + np.arange(shape.quadrature_count)
-        self.chunk_count = -(-len(points) // CHUNK)
-        missing = self.chunk_count * CHUNK - len(points)
+        missing = -len(points) % CHUNK
         points = np.pad(points, ((0, missing), (0, 0)), mode="edge")
         quadrature = np.pad(quadrature, ((0, missing), (0, 0)), constant_values=-1)
         real = quadrature >= 0
@@ -326,7 +331,7 @@ class VectorizedForce:
 
     def _chunked(self, rows: np.ndarray, dtype: type) -> wp.array:
         """Rows (count, ...) as one array with those of a chunk innermost."""
-        chunks = rows.reshape(self.chunk_count, CHUNK, -1).transpose(0, 2, 1)
+        chunks = rows.reshape(len(rows) // CHUNK, CHUNK, -1).transpose(0, 2, 1)
         return wp.array(np.ascontiguousarray(chunks, dtype=wp.dtype_to_numpy(dtype)).ravel(), dtype=dtype, device="cpu")
 
     def _gradients(
@@ -373,8 +378,7 @@ class VectorizedForce:
 
     def add(self, u: wp.array, force_out: wp.array) -> None:
         """Adds the internal forces at ``u`` to ``force_out``."""
-        key = (u.ptr, force_out.ptr, wp.get_device("cpu").is_capturing)
-        run, work = self._recordings.get(key, lambda: self._record(u, force_out))
+        run, work = self._recordings.get((u.ptr, force_out.ptr), lambda: self._record(u, force_out))
         run(work)
 
     def _record(self, u: wp.array, force_out: wp.array) -> tuple[Callable[[list[Job]], None], list[Job]]:

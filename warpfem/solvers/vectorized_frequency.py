@@ -68,9 +68,9 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
     t = types(dim, dtype)
     scalar, vector, matrix = t.scalar, t.vector, t.matrix
     width, places = row.width, row.places
-    row_vectors = wp.types.matrix(shape=(width, dim), dtype=scalar)
-    read = Readers(constitutive.parameter_count, dim, dtype, uniform)
-    view, read_gradients, read_parameters = read.view, read.gradients, read.parameters
+    read = Readers(width, constitutive.parameter_count, dim, dtype, uniform)
+    row_vectors, view, read_row = read.row_vectors, read.view, read.row
+    read_gradients, read_parameters = read.gradients, read.parameters
     packed = packed_point_functions(dim, dtype, width)
     values_of_rows = wp.types.vector(length=CHUNK, dtype=scalar)
     pack, load_rows = packed.pack, packed.load_rows
@@ -138,11 +138,7 @@ def _frequency_kernel(constitutive: Constitutive, shape: Shape, dtype: str, unif
             B = view(inverse_shape, chunk, wp.static(places * dim * dim))
             p = view(parameters, chunk, wp.static(0 if uniform else places * constitutive.parameter_count))
             for lane in range(wp.static(CHUNK)):
-                x = row_vectors()
-                for a in range(wp.static(width)):
-                    for i in range(wp.static(dim)):
-                        x[a, i] = displacements[(a * wp.static(dim) + i) * wp.static(CHUNK) + lane]
-                square, holds = largest_square(x, B, p, lane)
+                square, holds = largest_square(read_row(displacements, lane), B, p, lane)
                 squares[lane] = square
                 known[lane] = holds
             for row in range(wp.static(CHUNK)):
